@@ -12,13 +12,13 @@ from typing import Any, TypeVar
 
 from advsearch.errors import InputError, resembling
 from advsearch.files import either
-from advsearch.options import told
+from advsearch.options import describe_value
 
 OTHER_TERMS = {"eot": "over", "minimal_perturbation": "smallest"}
 """Terms of the literature for settings that have another name here."""
 DEVICES = ("device", "cuda", "gpu", "use_cuda")
 
-NOWHERE = {
+UNSUPPORTED_KEYWORDS = {
     **dict.fromkeys(
         DEVICES,
         "pictures are made on the processor, and a model stays on "
@@ -30,7 +30,7 @@ NOWHERE = {
     ),
 }
 
-WORDS = {
+TYPE_WORDS = {
     "str": "a text",
     "Path": "a path",
     "bool": "True or False",
@@ -51,7 +51,7 @@ ALIASES = {
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def unexpected(
+def make_unexpected_error(
     function: str, keywords: Mapping[str, object], known: Sequence[str]
 ) -> TypeError | None:
     """Return the error for the first keyword that a function does not have, with the
@@ -60,7 +60,7 @@ def unexpected(
     for name in keywords:
         if name in known:
             continue
-        suggestions, reason = meant_by(name, known)
+        suggestions, reason = suggest_keyword(name, known)
         if not suggestions and name.lower() not in DEVICES:
             suggestions = resembling(name, known)[:2]
         hint = ""
@@ -75,13 +75,13 @@ def unexpected(
     return None
 
 
-def meant_by(name: str, known: Sequence[str]) -> tuple[list[str], str]:
+def suggest_keyword(name: str, known: Sequence[str]) -> tuple[list[str], str]:
     """Return the known keyword that the literature gives this name, in a list, and why
     there is no such keyword here, if there is a reason.
     """
     term = OTHER_TERMS.get(name.lower())
     suggestions = [term] if term is not None and term in known else []
-    return suggestions, NOWHERE.get(name.lower(), "")
+    return suggestions, UNSUPPORTED_KEYWORDS.get(name.lower(), "")
 
 
 def check_types(
@@ -97,12 +97,17 @@ def check_types(
         parameter = parameters.get(name)
         if parameter is None or value is parameter.default or hasattr(value, "tolist"):
             continue
-        type_names = _kinds(str(parameter.annotation))
-        if type_names and not any(_fits(kind, value) for kind in type_names):
+        type_names = _parse_annotation(str(parameter.annotation))
+        if type_names and not any(_has_type(kind, value) for kind in type_names):
             expected = either(
-                [WORDS.get(kind, f"a {kind.rpartition('.')[2]}") for kind in type_names]
+                [
+                    TYPE_WORDS.get(kind, f"a {kind.rpartition('.')[2]}")
+                    for kind in type_names
+                ]
             )
-            raise InputError(f"{name}: expected {expected}, got {told(value)}")
+            raise InputError(
+                f"{name}: expected {expected}, got {describe_value(value)}"
+            )
         if name == "run" and isinstance(value, str) and not value.strip():
             raise InputError(
                 "run: expected the name of a run or a folder, got an "
@@ -110,7 +115,7 @@ def check_types(
             )
 
 
-def _kinds(annotation: str) -> list[str]:
+def _parse_annotation(annotation: str) -> list[str]:
     """Return the names of the types in an annotation; empty if it allows others."""
     without_parameters = annotation
     n_replaced = 1
@@ -125,7 +130,7 @@ def _kinds(annotation: str) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _fits(kind: str, value: object) -> bool:
+def _has_type(kind: str, value: object) -> bool:
     """Whether a value has the type of a name."""
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     is_text = isinstance(value, (str, bytes))
@@ -144,14 +149,14 @@ def _fits(kind: str, value: object) -> bool:
     return kind.rpartition(".")[2] in class_names
 
 
-def helped(function: Function) -> Function:
+def with_checked_arguments(function: Function) -> Function:
     """Make a function reject unknown keywords and values of wrong types, see above."""
     signature = inspect.signature(function)
     parameters = signature.parameters
 
     @wraps(function)
     def wrapper(*args: Any, **keywords: Any) -> Any:
-        error = unexpected(function.__name__, keywords, list(parameters))
+        error = make_unexpected_error(function.__name__, keywords, list(parameters))
         if error:
             raise error
         positional = dict(zip(parameters, args, strict=False))

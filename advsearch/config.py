@@ -19,24 +19,24 @@ from pydantic import Field, JsonValue, field_validator, model_validator
 from advsearch import registry
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
-from advsearch.options import JOINED, by_key, things_as_text
+from advsearch.options import TASK_SEPARATOR, format_things, group_mitsuba_keys
 from advsearch.settings import Clash, Config, setting, setting_as_in
 from advsearch.settings import values as written
 from advsearch.trust import powers
 
-FOLDERS = ("references", "state")
+PATH_OPTIONS = ("references", "state")
 """Options that may be a directory or a file. Its absolute path is stored, so that a run
 may be resumed anywhere.
 """
 
 
-def read_named(value: Any, setting: str, otherwise: str) -> Any:
+def read_named(value: Any, setting: str, default_name: str) -> Any:
     """Read a name, or a mapping with a `name` and options.
 
     Args:
         value: ``NAME``, ``NAME={OPTION: VALUE}`` or such a mapping.
         setting: its name, for messages.
-        otherwise: the name of a mapping without one.
+        default_name: the name of a mapping without one.
     """
     if isinstance(value, str) and "=" in value:
         name, options = written.parse_assignment(value, setting)
@@ -46,15 +46,15 @@ def read_named(value: Any, setting: str, otherwise: str) -> Any:
     if not isinstance(value, Mapping):
         return value
     options = {key: option for key, option in value.items() if key != "name"}
-    for key in FOLDERS:
+    for key in PATH_OPTIONS:
         path = options.get(key)
         if isinstance(path, (str, os.PathLike)) and path:
             options[key] = str(Path(path).expanduser().absolute())
-    name = value.get("name", otherwise)
+    name = value.get("name", default_name)
     return {"name": name, **options} if options else name
 
 
-def read_joined(value: Any, setting: str, otherwise: str) -> Any:
+def read_joined(value: Any, setting: str, default_name: str) -> Any:
     """Read one name with options as `read_named`, or several joined with + or in a list.
 
     Several become their names with + between them, and under each name its options:
@@ -62,12 +62,12 @@ def read_joined(value: Any, setting: str, otherwise: str) -> Any:
     """
     entries = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
     if not isinstance(entries, (list, tuple)) or len(entries) < 2:
-        return read_named(value, setting, otherwise)
+        return read_named(value, setting, default_name)
     names = []
     options: dict[str, dict[str, Any]] = {}
     for entry in entries:
         text = entry.strip() if isinstance(entry, str) else entry
-        named = read_named(text, setting, otherwise)
+        named = read_named(text, setting, default_name)
         mapping = dict(named) if isinstance(named, Mapping) else {"name": named}
         name = mapping.pop("name", None)
         if not isinstance(name, str) or not name:
@@ -82,7 +82,9 @@ def read_joined(value: Any, setting: str, otherwise: str) -> Any:
         options[names[-1]] = {}
         options.update(last_options)
     options = {name: value for name, value in options.items() if value}
-    return read_named({**options, "name": JOINED.join(names)}, setting, otherwise)
+    return read_named(
+        {**options, "name": TASK_SEPARATOR.join(names)}, setting, default_name
+    )
 
 
 def has_address(model: str) -> bool:
@@ -91,7 +93,7 @@ def has_address(model: str) -> bool:
     return any(re.match("https?:", name, re.IGNORECASE) for name in names)
 
 
-def name_in(named: str | Mapping[str, object]) -> str:
+def get_name(named: str | Mapping[str, object]) -> str:
     """Return the name in what `read_named` returns."""
     return named if isinstance(named, str) else str(named["name"])
 
@@ -100,7 +102,7 @@ DEFAULT_ENVIRONMENT = "studio"
 """The environment that lights a scene by default. Equal to
 `scene.description.DEFAULT_ENVIRONMENT`, as a test checks.
 """
-SEVERAL = (
+LIST_SETTINGS = (
     "object",
     "environment",
     "model",
@@ -111,16 +113,18 @@ SEVERAL = (
     "held_out_environment",
 )
 """The settings that may be several names, where a command takes several."""
-TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
+TEXT_SETTINGS = (*LIST_SETTINGS, "task", "up", "camera", "run", "objective")
 """The settings that are texts, whatever they are given as."""
 # controls as they are asked for: their names, each with its settings
 ControlsByName = dict[str, dict[str, object]]
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none, with the denoiser and without."""
-AUTO_SHARE = 2  # with `--spp auto` a search takes the default's samples divided by this
+AUTO_SPP_DIVISOR = (
+    2  # with `--spp auto` a search takes the default's samples divided by this
+)
 # then a candidate is rendered so many times more, at most, while it is not clearly
 # worse than the best
-CLOSE_LOOKS = 4
+MAX_EXTRA_REPEATS = 4
 
 
 class SceneConfig(Config):
@@ -132,7 +136,7 @@ class SceneConfig(Config):
     free: ClassVar[tuple[str, ...]] = (*Config.free, "ask")
     default_environment: ClassVar[str] = DEFAULT_ENVIRONMENT
     # which of object, environment and model may be several, with commas
-    several: ClassVar[tuple[str, ...]] = ()
+    list_settings: ClassVar[tuple[str, ...]] = ()
     clashes: ClassVar[tuple[Clash, ...]] = (
         Clash(
             "threads",
@@ -315,7 +319,7 @@ class SceneConfig(Config):
         "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
         flag="--control",
         metavar="NAME",
-        read_texts=written.read_controls,
+        read_texts=written.parse_controls,
         min_length=1,
     )
     texture_resolution: int | None = setting(
@@ -378,7 +382,7 @@ class SceneConfig(Config):
     @model_validator(mode="after")
     def _check_counts(self) -> SceneConfig:
         """Check that settings with one name have no several."""
-        tasks = self.task_name.split(JOINED)
+        tasks = self.task_name.split(TASK_SEPARATOR)
         for setting_name in ("object", "environment", "model"):
             names = written.split_names(getattr(self, setting_name) or "")
             if setting_name == "model" and len(tasks) > 1:
@@ -388,8 +392,8 @@ class SceneConfig(Config):
                         f"for each of {', '.join(tasks)}, "
                         f"got {len(names)}"
                     )
-            elif len(names) > 1 and setting_name not in self.several:
-                raise one_only(setting_name, names)
+            elif len(names) > 1 and setting_name not in self.list_settings:
+                raise make_single_value_error(setting_name, names)
         if self.size is not None and len(self.objects) > 1:
             raise InputError(
                 "size: it is the size of one object, and there are "
@@ -398,13 +402,13 @@ class SceneConfig(Config):
         return self
 
     @property
-    def title(self) -> tuple[str, ...]:
+    def title_words(self) -> tuple[str, ...]:
         return self.object, *self.controls
 
     @property
     def task_name(self) -> str:
         """The name of the task."""
-        return name_in(self.task)
+        return get_name(self.task)
 
     @property
     def used_threads(self) -> int | None:
@@ -412,12 +416,12 @@ class SceneConfig(Config):
         return 1 if self.deterministic else self.threads
 
     @property
-    def lit_by(self) -> str:
+    def environment_name(self) -> str:
         """The environment by name: the default one where none was asked for."""
         return self.environment or DEFAULT_ENVIRONMENT
 
     @property
-    def kinds_of_controls(self) -> tuple[str, ...]:
+    def control_kinds(self) -> tuple[str, ...]:
         """What says of which kind the controls are: their names, or the `kind` among
         their settings.
         """
@@ -430,7 +434,7 @@ class SceneConfig(Config):
         denoiser.
         """
         if self.spp == "auto":
-            return SEARCH_SPP[self.denoise] // AUTO_SHARE
+            return SEARCH_SPP[self.denoise] // AUTO_SPP_DIVISOR
         return self.spp if isinstance(self.spp, int) else SEARCH_SPP[self.denoise]
 
     @property
@@ -444,11 +448,11 @@ class SceneConfig(Config):
         }
 
     @property
-    def close_looks(self) -> int:
+    def max_extra_repeats(self) -> int:
         """Renders more of a search's best configurations, at most, while it is close
         between them.
         """
-        return CLOSE_LOOKS if self.spp == "auto" else 0
+        return MAX_EXTRA_REPEATS if self.spp == "auto" else 0
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -459,24 +463,24 @@ class SceneConfig(Config):
         """The models by name; those of several tasks are one together."""
         return (
             (self.model,)
-            if JOINED in self.task_name
+            if TASK_SEPARATOR in self.task_name
             else written.split_names(self.model)
         )
 
-    @field_validator(*TEXTS, mode="before", check_fields=False)
+    @field_validator(*TEXT_SETTINGS, mode="before", check_fields=False)
     @classmethod
     def _as_text(cls, value: Any, info: Any) -> Any:
         listed = info.field_name == "labels" and isinstance(value, (list, tuple))
         if listed and any("," in str(name) for name in value):
             raise ValueError("a name that would be two; a file can have it")
-        return written.as_text(value, several=info.field_name in SEVERAL)
+        return written.to_text(value, several=info.field_name in LIST_SETTINGS)
 
     @field_validator("facing", mode="before", check_fields=False)
     @classmethod
     def _with_a_sign(cls, value: Any) -> Any:
         return f"+{value}" if value in ("x", "y", "z") else value
 
-    _things_as_text = field_validator("things", mode="before")(things_as_text)
+    _things_as_text = field_validator("things", mode="before")(format_things)
 
     @field_validator("prompt", mode="before")
     @classmethod
@@ -501,7 +505,7 @@ class SceneConfig(Config):
             return value
         return {
             name: {} if options is None else options
-            for name, options in by_key(value).items()
+            for name, options in group_mitsuba_keys(value).items()
         }
 
     @field_validator("resolution", mode="before")
@@ -541,12 +545,14 @@ class SceneConfig(Config):
         if not isinstance(value, Mapping):
             return value
         # YAML takes 1e-3 for text
-        return {name: written.number_or_text(text) for name, text in value.items()}
+        return {
+            name: written.parse_number_or_text(text) for name, text in value.items()
+        }
 
 
-def one_only(name: str, names: Sequence[str]) -> InputError:
+def make_single_value_error(name: str, names: Sequence[str]) -> InputError:
     """Return the error for several objects, environments or models where one is expected."""
-    listed = written.shown(",".join(names))
+    listed = written.format_value(",".join(names))
     return InputError(
         f"{name}: expected one {name}, got {listed}; give one, or "
         "compare several with advsearch sweep"
@@ -554,7 +560,7 @@ def one_only(name: str, names: Sequence[str]) -> InputError:
 
 
 PICTURE_SPP = 64  # samples a pixel of a picture that is made to be looked at
-PICTURES = (".png", ".exr")  # that can be written
+IMAGE_SUFFIXES = (".png", ".exr")  # that can be written
 
 
 class RenderConfig(SceneConfig):
@@ -611,14 +617,14 @@ class RenderConfig(SceneConfig):
         if (
             not isinstance(text, str)
             or "\0" in text
-            or Path(text).suffix.lower() not in PICTURES
+            or Path(text).suffix.lower() not in IMAGE_SUFFIXES
         ):
             raise ValueError("not a picture")
         return text
 
 
 # no control has a distance of that size; far above it, its square is none in float32
-LARGEST_EPSILON = 1e6
+MAX_EPSILON = 1e6
 
 
 class DerivativeConfig(SceneConfig):
@@ -642,7 +648,7 @@ class DerivativeConfig(SceneConfig):
         "how far a control may move from its start, in its own unit (for several "
         "controls CONTROL=NUMBER,...; in "
         "`attack` also NUMBER,NUMBER,... for a curve)",
-        f"a number greater than 0 and at most {LARGEST_EPSILON:g}",
+        f"a number greater than 0 and at most {MAX_EPSILON:g}",
         otherwise="the control's own",
     )
     norm: Literal["linf", "l2"] | None = setting(
@@ -691,7 +697,7 @@ class DerivativeConfig(SceneConfig):
                 pairs = [
                     written.parse_assignment(entry, "epsilon") for entry in entries
                 ]
-                written.check_once((name for name, _ in pairs), "epsilon")
+                written.check_no_duplicates((name for name, _ in pairs), "epsilon")
                 value = dict(pairs)
             else:
                 value = tuple(entries)
@@ -703,9 +709,11 @@ class DerivativeConfig(SceneConfig):
             values = list(value)
         else:
             values = [1.0 if value is None else value]
-        numbers = [_positive(number) for number in values]
+        numbers = [_parse_positive(number) for number in values]
         if isinstance(value, (list, tuple)):
-            written.check_once((f"{number:g}" for number in numbers), "epsilon")
+            written.check_no_duplicates(
+                (f"{number:g}" for number in numbers), "epsilon"
+            )
         if not numbers:
             raise ValueError("nothing is named")
         return value
@@ -716,24 +724,27 @@ class DerivativeConfig(SceneConfig):
         return self.epsilon if isinstance(self.epsilon, tuple) else ()
 
 
-def _positive(value: Any) -> float:
+def _parse_positive(value: Any) -> float:
     try:
         number = float("nan") if isinstance(value, bool) else float(value)
     except (TypeError, OverflowError):
         raise ValueError("not a number") from None
     # what is smaller has no square in float32
-    if not 1e-30 < number <= LARGEST_EPSILON:
+    if not 1e-30 < number <= MAX_EPSILON:
         raise ValueError("out of range")
     return number
 
 
-FIRST = ("attack", "render", "sweep")  # the first commands in the docs
+FIRST_COMMANDS = ("attack", "render", "sweep")  # the first commands in the docs
 
 
 class _Configs(Mapping[str, type[Config]]):
     def __iter__(self) -> Iterator[str]:
         return iter(
-            sorted(registry.EXPERIMENTS, key=lambda name: (name not in FIRST, name))
+            sorted(
+                registry.EXPERIMENTS,
+                key=lambda name: (name not in FIRST_COMMANDS, name),
+            )
         )
 
     def __len__(self) -> int:

@@ -21,7 +21,7 @@ FROM_PYTHON = "from Python"  # the name of one that no file can hold
 QUANTILES = (0.05, 0.5, 0.95)
 
 
-class OwnQuantiles(dict[str, object]):
+class PythonQuantiles(dict[str, object]):
     """The setting of an inverse CDF from Python, with the function itself.
 
     Attributes:
@@ -48,7 +48,7 @@ def _loc_scale(d: Any) -> dict[str, Any]:
     return {"loc": d.loc, "scale": d.scale}
 
 
-TORCH: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] = {
+TORCH_DISTRIBUTIONS: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] = {
     **{
         torch_name: (scipy_name, _loc_scale)
         for torch_name, scipy_name in (
@@ -70,11 +70,11 @@ TORCH: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] = {
 """Name in scipy and parameters there of each class of `torch.distributions`."""
 
 
-def as_setting(given: object) -> object:
+def distribution_to_setting(value: object) -> object:
     """Return a parameter's distribution as a setting that a file can hold.
 
     Args:
-        given: a distribution of torch, a frozen one of scipy, anything else with an
+        value: a distribution of torch, a frozen one of scipy, anything else with an
             `icdf` or a `ppf`, an inverse CDF (a function from a probability to a
             value), or a mapping from choices to their weights. Anything else is
             returned as it is.
@@ -83,24 +83,27 @@ def as_setting(given: object) -> object:
         InputError: it is of several numbers, or of integers, or a function that is no
             inverse CDF.
     """
-    if isinstance(given, Mapping):
+    if isinstance(value, Mapping):
         # numpy's, torch's
         weights = [
-            w.item() if getattr(w, "ndim", 1) == 0 else w for w in given.values()
+            w.item() if getattr(w, "ndim", 1) == 0 else w for w in value.values()
         ]
         numbers = all(
             isinstance(w, (int, float)) and not isinstance(w, bool) for w in weights
         )
-        if given and numbers and not given.keys() & {DISTRIBUTION, CHOICES}:
+        if value and numbers and not value.keys() & {DISTRIBUTION, CHOICES}:
             # of no float: whoever reads the setting says what it takes
             with suppress(OverflowError):
-                return {CHOICES: list(given), WEIGHTS: list(map(float, weights))}
-        return given
-    kind = type(given)
-    if kind.__module__.startswith("torch.distributions") and kind.__name__ in TORCH:
-        name, parameters = TORCH[kind.__name__]
-        return _named(name, parameters(given))
-    family = getattr(given, "dist", given)
+                return {CHOICES: list(value), WEIGHTS: list(map(float, weights))}
+        return value
+    kind = type(value)
+    if (
+        kind.__module__.startswith("torch.distributions")
+        and kind.__name__ in TORCH_DISTRIBUTIONS
+    ):
+        name, parameters = TORCH_DISTRIBUTIONS[kind.__name__]
+        return _named(name, parameters(value))
+    family = getattr(value, "dist", value)
     if hasattr(family, "pmf") and hasattr(family, "ppf"):
         raise InputError(
             f"distribution {getattr(family, 'name', kind.__name__)}: expected one of "
@@ -111,8 +114,8 @@ def as_setting(given: object) -> object:
     of_scipy = getattr(
         sys.modules.get("scipy.stats"), str(getattr(family, "name", "")), NotImplemented
     )
-    if family is not given and type(family) is type(of_scipy):
-        frozen: Any = given
+    if family is not value and type(family) is type(of_scipy):
+        frozen: Any = value
         shapes, loc, scale = frozen.dist._parse_args(*frozen.args, **frozen.kwds)
         names = [
             name.strip()
@@ -123,18 +126,18 @@ def as_setting(given: object) -> object:
             frozen.dist.name,
             {**dict(zip(names, shapes, strict=True)), "loc": loc, "scale": scale},
         )
-    quantile = getattr(given, "icdf", None) or getattr(given, "ppf", None)
+    quantile = getattr(value, "icdf", None) or getattr(value, "ppf", None)
     if quantile and kind.__module__.startswith("torch"):
         torch = sys.modules["torch"]  # it is there: the distribution is one of its own
-        return OwnQuantiles(
+        return PythonQuantiles(
             kind.__name__,
             lambda share: float(quantile(torch.tensor(share, dtype=torch.float64))),
         )
     if quantile:
-        return OwnQuantiles(kind.__name__, quantile)
-    if callable(given) and not isinstance(given, type):
-        return OwnQuantiles(str(getattr(given, "__name__", kind.__name__)), given)
-    return given
+        return PythonQuantiles(kind.__name__, quantile)
+    if callable(value) and not isinstance(value, type):
+        return PythonQuantiles(str(getattr(value, "__name__", kind.__name__)), value)
+    return value
 
 
 def _named(name: str, parameters: Mapping[str, Any]) -> dict[str, object]:

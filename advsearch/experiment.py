@@ -32,11 +32,11 @@ from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.runs.summary import read_result
 from advsearch.settings import Config
 from advsearch.trust.writing import write_bytes
-from advsearch.viewer.pages import keep_result
+from advsearch.viewer.pages import write_result
 
 Settings = TypeVar("Settings", bound=Config, covariant=True)
 AnyResult = TypeVar("AnyResult", bound=Result)
-Made = TypeVar("Made", bound=Result)
+ResultType = TypeVar("Made", bound=Result)
 
 SHARED_RESULT_FIELDS = {
     "object": "object",
@@ -135,7 +135,7 @@ class RunContext(ExitStack, Generic[Settings]):
         """
         return {"cpu": threads.read_processor_name(), "cores": threads.cores()}
 
-    def result(self, result_type: type[Made], **fields: Any) -> Made:
+    def result(self, result_type: type[ResultType], **fields: Any) -> ResultType:
         """Return a result with the given fields and those that every result has.
 
         These are what the settings state (`SHARED_RESULT_FIELDS`), the run, how it
@@ -182,7 +182,7 @@ def run_and_save(
             write_bytes(
                 context.run.path / "images" / f"{context.config.command}.{suffix}", data
             )
-        return keep_result(context.run, result)
+        return write_result(context.run, result)
 
 
 def run_experiment(
@@ -213,7 +213,7 @@ def find_stopped_run(config: Config) -> Path | None:
     """Return the folder of the run that the settings name; None where there is none
     yet.
     """
-    run, _ = config.place
+    run, _ = config.run_location
     if run is None or not is_run(run_path(run)):
         return None
     return run_path(run)
@@ -243,7 +243,7 @@ def run_part(
     if finished(folder):
         return read_result(folder)
     return run(
-        type(config).from_yaml(folder / CONFIG, config.asked),
+        type(config).from_yaml(folder / CONFIG, config.session_settings),
         progress=progress,
         resumed=folder,
     )
@@ -254,11 +254,11 @@ class PositionalArgument(NamedTuple):
 
     metavar: str  # what the help calls it
     expected: str  # completes "expected ..." where it is missing
-    more: str = ""  # what the help adds
-    many: bool = False  # whether there may be several
+    help_suffix: str = ""  # what the help adds
+    is_repeatable: bool = False  # whether there may be several
 
 
-def succeed(result: Any) -> int:
+def always_succeed(result: Any) -> int:
     return 0
 
 
@@ -315,7 +315,7 @@ class Experiment(Generic[AnyResult]):
     python_arguments: str = ""
     resumes_in_python: bool = False
     help_suffix: str = ""
-    exit_status: Callable[[Any], int] = succeed
+    exit_status: Callable[[Any], int] = always_succeed
     choices: str = ""
     choice_description: str = ""
     view: Callable[[Any], ShownResult] | None = None
@@ -350,13 +350,16 @@ class Experiment(Generic[AnyResult]):
     def python(self) -> Callable[..., Any]:
         """The function for Python, with every setting as a keyword."""
         if self.python_function:
-            function: Callable[..., Any] = registry.imported(self.python_function)
+            function: Callable[..., Any] = registry.load_attribute(self.python_function)
             return function
         return self._make_python_function()
 
     def _make_python_function(self) -> Callable[..., Any]:
         """Create the function for Python callers from the settings."""
-        from advsearch.api.keywords import asks, configured  # imports torch
+        from advsearch.api.keywords import (
+            make_config,
+            with_settings_signature,
+        )  # imports torch
 
         own_arguments = self._find_python_arguments()
 
@@ -371,7 +374,7 @@ class Experiment(Generic[AnyResult]):
                 for name, value in values.items()
                 if name not in own_arguments or name in self.positional_args
             }
-            config = configured(self.settings, **config_values)
+            config = make_config(self.settings, **config_values)
             resumed = find_stopped_run(config) if resume else None
             return self.run(
                 config, progress=watcher(progress), resumed=resumed, **arguments
@@ -383,7 +386,7 @@ class Experiment(Generic[AnyResult]):
         function.__qualname__ = self.settings.command
         function.__doc__ = self.function.__doc__
         function.__module__ = self.function.__module__
-        return asks(self.settings)(function)
+        return with_settings_signature(self.settings)(function)
 
     def _make_signature(
         self, own_arguments: Mapping[str, inspect.Parameter]
@@ -412,7 +415,7 @@ class Experiment(Generic[AnyResult]):
         """Return the parameters by name that Python callers may pass next to settings."""
         if not self.python_arguments:
             return {}
-        function = registry.imported(self.python_arguments)
+        function = registry.load_attribute(self.python_arguments)
         return {
             name: parameter
             for name, parameter in inspect.signature(function).parameters.items()

@@ -129,7 +129,7 @@ def total_variation(colors: Tensor) -> Tensor:
         colors: (N, h, w, 3) sRGB in [0, 1], a texture or pictures; or (N, h, w, 4), of
             which only pixels with a last channel over 0 count.
     """
-    return torch.stack([judging.variation(image) for image in _to_batch(colors)])
+    return torch.stack([judging.mean_variation(image) for image in _to_batch(colors)])
 
 
 def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
@@ -144,7 +144,7 @@ def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
             125 of `printable`.
     """
     return torch.stack(
-        [judging.off_print(image, palette) for image in _to_batch(colors)]
+        [judging.printable_distance(image, palette) for image in _to_batch(colors)]
     )
 
 
@@ -154,7 +154,7 @@ nps = non_printability  # its usual short name
 # ---- as objectives
 
 
-def check_aim(objective: object, *, targeted: bool) -> None:
+def check_direction(objective: object, *, targeted: bool) -> None:
     """Check that a loss of this module, or of torch, rises where a search is to go.
 
     Any other objective passes.

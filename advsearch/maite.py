@@ -23,11 +23,11 @@ from torch import Tensor, nn
 
 from advsearch import models
 from advsearch.engine import loading
-from advsearch.engine.judging import domain_of
+from advsearch.engine.judging import make_domain
 from advsearch.errors import InputError
 from advsearch.models.labels import find_label_set
-from advsearch.scene.color import to_8_bit
-from advsearch.scene.outlines import seen_things
+from advsearch.scene.color import round_to_8_bit
+from advsearch.scene.outlines import find_visible_meshes
 from advsearch.tasks import make_task
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["Detections", "Scenes", "load_model"]
 
 
-class _Theirs(nn.Module):
+class _MaiteNetwork(nn.Module):
     """A model of MAITE, called as torchvision's models are."""
 
     def __init__(self, model: Any, task: str) -> None:
@@ -112,7 +112,7 @@ def load_model(
         ]
     name = options.pop("name", str(metadata.get("id", type(model).__name__)))
     return models.load_model(
-        _Theirs(model, task),
+        _MaiteNetwork(model, task),
         task=make_task(task),
         input_size=input_size,
         labels=labels,
@@ -180,13 +180,13 @@ class Scenes:
         self.task = task
         self.spp = spp
         self.seed = seed
-        description = self.renderer.scene.made[0]
+        description = self.renderer.scene.definition[0]
         self.right = find_label_set(
             label or description.object.label or description.object_name, self.labels
         )
         self.space = cast("Any", self.renderer.space)
-        domain = domain_of(self.space.controls)
-        self.us = domain.sample(torch.Generator().manual_seed(seed), count)
+        domain = make_domain(self.space.controls)
+        self.configurations = domain.sample(torch.Generator().manual_seed(seed), count)
         index2label = dict(enumerate(self.labels))
         self.metadata = {
             "id": f"advsearch-{description.object_name}-{seed}",
@@ -194,33 +194,33 @@ class Scenes:
         }
 
     def __len__(self) -> int:
-        return len(self.us)
+        return len(self.configurations)
 
     def __getitem__(
         self, number: int
     ) -> tuple[Tensor, Tensor | Detections, dict[str, Any]]:
         # Raises IndexError, which ends a loop.
         index = range(len(self))[number]
-        u = self.us[index]
+        u = self.configurations[index]
         with torch.no_grad():
-            image = to_8_bit(self.renderer(u, seed=index, spp=self.spp))
+            image = round_to_8_bit(self.renderer(u, seed=index, spp=self.spp))
         values = self.space.describe(u)
         metadata = {
             "id": index,
             **{name: value["value"] for name, value in values.items()},
         }
-        return image.permute(2, 0, 1).contiguous(), self._target(u), metadata
+        return image.permute(2, 0, 1).contiguous(), self._make_target(u), metadata
 
-    def _target(self, u: Tensor) -> Tensor | Detections:
+    def _make_target(self, u: Tensor) -> Tensor | Detections:
         """Return the target of a configuration (d,)."""
         right_class = self.right.indices[0]
         if self.task == "classification":
             one_hot = nn.functional.one_hot(torch.tensor(right_class), len(self.labels))
             return one_hot.float()
-        meshes = self.renderer.scene.made[0].meshes
+        meshes = self.renderer.scene.definition[0].meshes
         boxes = []
         classes = []
-        for thing in seen_things(self.renderer, u):
+        for thing in find_visible_meshes(self.renderer, u):
             class_id: int | None = right_class
             if thing.name != "object":
                 name = meshes[thing.name].label or thing.name

@@ -18,12 +18,14 @@ from advsearch.files import JsonValue
 
 # Metadata of a field that is no option: it depends on what a run works with.
 FROM_RUN = {"set by": "the run"}
-MOST = 1_000_000  # maximum of a number in options: no budget has more renders
-BY_KEY = "mitsuba"  # the control whose parameters have Mitsuba's names
-JOINED = "+"  # separates the names of joint tasks, one for each of several models
+MAX_OPTION = 1_000_000  # maximum of a number in options: no budget has more renders
+MITSUBA_CONTROL = "mitsuba"  # the control whose parameters have Mitsuba's names
+TASK_SEPARATOR = (
+    "+"  # separates the names of joint tasks, one for each of several models
+)
 
 
-def by_key(controls: Mapping[str, object]) -> dict[str, object]:
+def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
     """Group Mitsuba's keys: return controls with ``{"mitsuba:KEY": RANGE}`` as
     ``{"mitsuba": {KEY: RANGE}}``.
 
@@ -36,23 +38,23 @@ def by_key(controls: Mapping[str, object]) -> dict[str, object]:
     ranges = dict[str, object]()
     for name, options in controls.items():
         kind, colon, key = str(name).partition(":")
-        if kind != BY_KEY or not colon:
+        if kind != MITSUBA_CONTROL or not colon:
             plain[name] = _with_parameter(str(name), options)
         elif not key or options is None or options in ({}, ""):
             raise InputError(
                 f"`controls` {name}: expected a range, as in "
-                f"{BY_KEY}:{key or 'KEY'}=[0.2, 0.8]"
+                f"{MITSUBA_CONTROL}:{key or 'KEY'}=[0.2, 0.8]"
             )
         else:
             ranges[key] = options
     if not ranges:
         return plain
-    grouped = plain.get(BY_KEY) or {}
+    grouped = plain.get(MITSUBA_CONTROL) or {}
     if not isinstance(grouped, Mapping) or grouped.keys() & ranges.keys():
         raise InputError(
-            f"`controls` {BY_KEY}: expected each of Mitsuba's names once, with a range"
+            f"`controls` {MITSUBA_CONTROL}: expected each of Mitsuba's names once, with a range"
         )
-    return {**plain, BY_KEY: {**grouped, **ranges}}
+    return {**plain, MITSUBA_CONTROL: {**grouped, **ranges}}
 
 
 def _with_parameter(name: str, options: object) -> object:
@@ -68,7 +70,7 @@ def _with_parameter(name: str, options: object) -> object:
     return {parameter: options} if is_range else options
 
 
-def things_as_text(things: object) -> str | None:
+def format_things(things: object) -> str | None:
     """Return things in a scene as the text that settings have: ``car@12,3.5,heading=180;
     person@6,-2``.
 
@@ -90,7 +92,7 @@ def things_as_text(things: object) -> str | None:
             f"these, got {things!r:.80}"
         )
     text = ";".join(
-        _thing_as_text(item) if isinstance(item, Mapping) else str(item)
+        _format_thing(item) if isinstance(item, Mapping) else str(item)
         for item in items
     )
     texts = []
@@ -104,7 +106,7 @@ def things_as_text(things: object) -> str | None:
     return "; ".join(texts) or None
 
 
-def _thing_as_text(thing: Mapping[str, Any]) -> str:
+def _format_thing(thing: Mapping[str, Any]) -> str:
     """Return a thing as text: its object, x and y, and further options."""
     required = ("object", "x", "y")
     if not thing.keys() >= {*required}:
@@ -118,7 +120,7 @@ def _thing_as_text(thing: Mapping[str, Any]) -> str:
     return ",".join([*position, *options])
 
 
-def declared_options(kind: type[Any]) -> dict[str, Field[Any]]:
+def list_declared_options(kind: type[Any]) -> dict[str, Field[Any]]:
     """Return the fields of a dataclass that are options, by name."""
     return {
         field.name: field
@@ -144,52 +146,52 @@ def check_options(
         UnknownNameError: there is no such option.
         InputError: a value is of another type.
     """
-    declared = declared_options(kind)
+    declared = list_declared_options(kind)
     for option, value in options.items():
         if option not in declared:
             raise UnknownNameError(f"option of {what} {name!r}:", option, declared)
         is_number = (
             isinstance(value, (int, float))
             and not isinstance(value, bool)
-            and not abs(value) > MOST
+            and not abs(value) > MAX_OPTION
         )
         is_integer = is_number and value % 1 == 0  # type: ignore[operator]
         fits, expected = {
-            "float": (is_number, f"a finite number from {-MOST} to {MOST}"),
-            "int": (is_integer, f"a whole number from {-MOST} to {MOST}"),
+            "float": (is_number, f"a finite number from {-MAX_OPTION} to {MAX_OPTION}"),
+            "int": (is_integer, f"a whole number from {-MAX_OPTION} to {MAX_OPTION}"),
             "bool": (isinstance(value, bool), "true or false"),
             "str": (isinstance(value, str), "a text"),
-        }.get(type_of(declared[option]), (True, ""))
+        }.get(get_option_type(declared[option]), (True, ""))
         if not fits:
             raise InputError(
                 f"{option} of {what} {name}: expected {expected}, got {value!r:.80}"
             )
 
 
-def type_of(option: Field[Any]) -> str:
+def get_option_type(option: Field[Any]) -> str:
     """Return the name of the type of an option."""
     return str(getattr(option.type, "__name__", option.type))
 
 
-def default_of(option: Field[Any]) -> Any:
+def get_option_default(option: Field[Any]) -> Any:
     """Return the default of an option; None if it has none."""
     if option.default is not MISSING:
         return option.default
     return None if option.default_factory is MISSING else option.default_factory()
 
 
-def _as_json(value: object) -> JsonValue:
+def _to_json(value: object) -> JsonValue:
     """Return a value as a JSON value; None if it, or a part of it, is none."""
     if isinstance(value, Mapping):
         mapping = {
-            name: _as_json(inner)
+            name: _to_json(inner)
             for name, inner in value.items()
             if isinstance(name, str)
         }
         is_complete = len(mapping) == len(value) and None not in mapping.values()
         return mapping if is_complete else None
     if isinstance(value, (list, tuple)):
-        items = [_as_json(inner) for inner in value]
+        items = [_to_json(inner) for inner in value]
         return None if None in items else items
     is_finite = isinstance(value, float) and math.isfinite(value)
     if is_finite or isinstance(value, (bool, int, str)):
@@ -197,7 +199,7 @@ def _as_json(value: object) -> JsonValue:
     return None
 
 
-def as_setting(entry: Any) -> str | dict[str, JsonValue]:
+def to_setting(entry: Any) -> str | dict[str, JsonValue]:
     """Return a policy or a task as a setting in a file: its name, with the options that differ
     from their defaults.
 
@@ -205,14 +207,16 @@ def as_setting(entry: Any) -> str | dict[str, JsonValue]:
     """
     name = str(entry.name)
     options = {}
-    for option, declared in declared_options(type(entry)).items():
+    for option, declared in list_declared_options(type(entry)).items():
         value = getattr(entry, option)
-        if (plain := _as_json(value)) is not None and value != default_of(declared):
+        if (plain := _to_json(value)) is not None and value != get_option_default(
+            declared
+        ):
             options[option] = plain
     return {"name": name, **options} if options else name
 
 
-def told(value: object) -> str:
+def describe_value(value: object) -> str:
     """Describe a value that is not the expected instance; for a class, how to create
     one.
     """
@@ -300,6 +304,6 @@ def count_outcomes(payloads: Iterable[object]) -> dict[str, int] | None:
     return named or None
 
 
-def rounded(number: float) -> str:
+def format_rounded(number: float) -> str:
     """Format a computed number for sentences: with three significant digits."""
     return f"{float(f'{number:.3g}'):g}"

@@ -34,7 +34,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
 
     group: str  # of entry points: "advsearch.policies"
     # The built-in entries; those of the catalog are imported on access.
-    own: Mapping[str, Entry | BuiltIn]
+    built_ins: Mapping[str, Entry | BuiltIn]
     # Description of an entry for messages: "a subclass of Policy whose name is that of
     # the entry point".
     expected: str
@@ -51,17 +51,17 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
                 not be imported (`check_import`).
         """
         if not self.names_class(name):
-            if name not in self.own:
+            if name not in self.built_ins:
                 return self._load(name)
-            built_in = self.own[name]
+            built_in = self.built_ins[name]
             if not isinstance(built_in, BuiltIn):
                 return built_in
-            target: Entry = imported(built_in.target)
+            target: Entry = load_attribute(built_in.target)
             return target
         check_import(name)
         try:
             with current_directory_importable():
-                entry: Entry = imported(name)
+                entry: Entry = load_attribute(name)
         except Exception as error:  # the user's code may raise anything
             raise InputError(
                 f"{name}: cannot be imported ({type(error).__name__}: {error}); "
@@ -77,11 +77,11 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             return False
         if self.names_class(name):
             return self[name] is not None
-        return name in self.own or name in self._installed
+        return name in self.built_ins or name in self._installed
 
     def __iter__(self) -> Iterator[str]:
-        added = [name for name in self._installed if name not in self.own]
-        return iter([*self.own, *added])
+        added = [name for name in self._installed if name not in self.built_ins]
+        return iter([*self.built_ins, *added])
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
@@ -90,7 +90,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """Return a sentence about an entry: of the catalog, or the first line of its docstring; if
         it cannot be imported, why.
         """
-        entry = self.own.get(name)
+        entry = self.built_ins.get(name)
         if isinstance(entry, BuiltIn):
             return f"{entry.help[0].upper()}{entry.help[1:]}."
         try:
@@ -115,7 +115,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         if not self.imports or not is_class_name:
             return False
         packages = module.split(".")
-        is_entry = packages[0] in self.own or packages[0] in self._installed
+        is_entry = packages[0] in self.built_ins or packages[0] in self._installed
         return not is_entry and all(package.isidentifier() for package in packages)
 
     @cached_property
@@ -150,9 +150,9 @@ def get_first_doc_line(entry: Any) -> str:
     return " ".join(summary.split())
 
 
-def imported(place: str) -> Any:
+def load_attribute(target: str) -> Any:
     """Import what "module:attribute" names."""
-    module, _, attribute = place.partition(":")
+    module, _, attribute = target.partition(":")
     return getattr(import_module(module), attribute)
 
 
@@ -164,7 +164,7 @@ def get_class(kind: str, name: str) -> Any:
     """
     for part in list_built_ins(kind).values():
         if part.target.endswith(f":{name}"):
-            return imported(part.target)
+            return load_attribute(part.target)
     raise AttributeError(f"there is no {kind} with a class {name}")
 
 
@@ -194,7 +194,7 @@ def get_experiment_help(name: str) -> str:
     """Return a line about an experiment: of the catalog, or the first line of the
     docstring of an installed one.
     """
-    built_in = EXPERIMENTS.own.get(name)
+    built_in = EXPERIMENTS.built_ins.get(name)
     if isinstance(built_in, BuiltIn):
         return built_in.help
     docstring = inspect.getdoc(get_experiment(name).function) or ""

@@ -36,10 +36,10 @@ from advsearch.errors import InputError
 from advsearch.options import OUT_OF_VIEW, Outcome
 from advsearch.runs.results import ConditionRow
 from advsearch.statistics.clustered import (
-    fewer_by_chance,
-    mean_share,
-    per_unit,
-    share_interval,
+    mean_rate,
+    one_sided_p_value,
+    rate_interval,
+    sum_per_unit,
 )
 
 MIN_ROWS = 100  # rows of which one half can choose and the other can count
@@ -131,23 +131,23 @@ def count_wrong_outcomes(rows: pd.DataFrame) -> dict[str, int] | None:
 
 
 def estimate_interval(table: pd.DataFrame) -> tuple[float, float]:
-    """Return the 95 % interval of `estimate_share`; 0 to 1 where there is no row."""
+    """Return the 95 % interval of `estimate_rate`; 0 to 1 where there is no row."""
     if table.empty:
         return 0.0, 1.0
-    return share_interval(*count_per_unit(table))
+    return rate_interval(*count_per_unit(table))
 
 
-def estimate_share(table: pd.DataFrame) -> float:
+def estimate_rate(table: pd.DataFrame) -> float:
     """Return the mean over units of the share of right predictions of each; NaN where
     there is no row.
     """
-    return mean_share(*count_per_unit(table))
+    return mean_rate(*count_per_unit(table))
 
 
 def count_per_unit(table: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
     """Return the right predictions and the predictions of each unit (m,)."""
-    n_right = per_unit(table["correct"], table["unit"])
-    n_rows = per_unit(np.ones(len(table)), table["unit"])
+    n_right = sum_per_unit(table["correct"], table["unit"])
+    n_rows = sum_per_unit(np.ones(len(table)), table["unit"])
     return n_right, n_rows
 
 
@@ -320,7 +320,7 @@ class CountedRule:
         """
         if self.inside.empty or self.elsewhere.empty:
             return 0.0
-        return estimate_share(self.elsewhere) - estimate_share(self.inside)
+        return estimate_rate(self.elsewhere) - estimate_rate(self.inside)
 
     @cached_property
     def p_value(self) -> float:
@@ -351,11 +351,11 @@ class CountedRule:
         units = np.concatenate([self.inside["unit"], self.elsewhere["unit"]])
         is_right = np.concatenate([self.inside["correct"], self.elsewhere["correct"]])
         is_inside = np.arange(len(units)) < len(self.inside)
-        right_inside = per_unit(is_inside & is_right, units)
-        rows_inside = per_unit(is_inside, units)
-        right_elsewhere = per_unit(~is_inside & is_right, units)
-        rows_elsewhere = per_unit(~is_inside, units)
-        return fewer_by_chance(
+        right_inside = sum_per_unit(is_inside & is_right, units)
+        rows_inside = sum_per_unit(is_inside, units)
+        right_elsewhere = sum_per_unit(~is_inside & is_right, units)
+        rows_elsewhere = sum_per_unit(~is_inside, units)
+        return one_sided_p_value(
             right_inside, rows_inside, right_elsewhere, rows_elsewhere, factor
         )
 

@@ -59,7 +59,9 @@ def assert_right(
     """
     __tracebackhide__ = True
     claim = {"claim": "right", "at_least": at_least, "pictures": pictures}
-    return _asserted(claim, object, {"model": model}, settings, confidence, seed, run)
+    return _assert_claim(
+        claim, object, {"model": model}, settings, confidence, seed, run
+    )
 
 
 def assert_not_broken(
@@ -83,7 +85,7 @@ def assert_not_broken(
         InputError: anything that the caller can put right.
     """
     __tracebackhide__ = True
-    return _asserted(
+    return _assert_claim(
         {"claim": "not_broken"}, object, {"model": model}, settings, 0.95, seed, run
     )
 
@@ -115,7 +117,7 @@ def assert_no_worse(
     """
     __tracebackhide__ = True
     claim = {"claim": "no_worse", "points": points, "pictures": pictures}
-    return _asserted(
+    return _assert_claim(
         claim, object, {"model": model, "than": than}, settings, confidence, seed, run
     )
 
@@ -137,18 +139,18 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
 
     experiment = workbench.get_experiment("test")
     workbench.allow_named(settings)
-    with workbench.in_turn():
+    with workbench.hold_process_lock():
         result: SuiteResult = experiment.run(
             experiment.settings(**{"suite": str(suite), **settings})
         )
     if bad := [claim for claim in result.claims if not claim.accepted]:
         raise AssertionError(
-            "\n\n".join(_report(result, claim, claim.repeat) for claim in bad)
+            "\n\n".join(_format_report(result, claim, claim.repeat) for claim in bad)
         )
     return result
 
 
-def _asserted(
+def _assert_claim(
     claim: Mapping[str, object],
     object: str | Path | workbench.Scene,
     models: Mapping[str, workbench.AnyModel],
@@ -178,7 +180,7 @@ def _asserted(
     experiment = workbench.get_experiment("test")
     claim_name = str(claim["claim"]).replace("_", "-")
     title = f"assert_{claim['claim']}"
-    with workbench.in_turn():
+    with workbench.hold_process_lock():
         workbench.allow_named(settings)
         for model in models.values():
             workbench.allow_named({"model": model})
@@ -186,12 +188,12 @@ def _asserted(
         claim_settings = dict(claim)
         python_only = [workbench.PythonOnly("call", f"of {title}")]
         for key, model in models.items():
-            model_name = workbench.model_name(model)
+            model_name = workbench.get_model_name(model)
             target = suite_settings if key == "model" else claim_settings
             target[key] = model_name
             if not isinstance(model, (str, Path)):
                 objects["model", model_name] = model
-            if workbench.exists_here(model):
+            if workbench.is_session_only(model):
                 python_only.append(workbench.PythonOnly("model", model_name))
         suite = {
             "title": title,
@@ -209,7 +211,7 @@ def _asserted(
         repeat = "call the same function with the same arguments"
         if test:
             repeat = f"pytest {shlex.quote(test)}"
-        raise AssertionError(_report(result, claim_result, repeat))
+        raise AssertionError(_format_report(result, claim_result, repeat))
     return result
 
 
@@ -239,7 +241,7 @@ def _name_objects(
     return named, objects
 
 
-def _report(result: SuiteResult, claim: ClaimResult, repeat: str) -> str:
+def _format_report(result: SuiteResult, claim: ClaimResult, repeat: str) -> str:
     """Return the message of a failed claim; `repeat` is what runs it again."""
     run = Path(result.run or "")
     lines = [

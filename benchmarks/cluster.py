@@ -49,10 +49,10 @@ from simulated_cluster import Simulated, SimulatedWorkers
 from sweep import ConstantRenderer, resident
 
 from advsearch.attacks import Evaluation
-from advsearch.engine.journal import Sent
+from advsearch.engine.journal import WorkItem
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import job as swept_scene
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.carry_out import load_job
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
@@ -225,8 +225,8 @@ def swept(
     config = SweepConfig(object="mug", grid=grid, trials=0, resolution=64)
     answer = Judgement(-3.2, 3.2, right=True, prediction=Prediction("mug", 3, 0.93))
 
-    def seen(sent: Sequence[Sent]) -> list[Evaluation]:
-        return [Evaluation.of(answer, seconds=0.03) for _ in sent]
+    def seen(sent: Sequence[WorkItem]) -> list[Evaluation]:
+        return [Evaluation.from_judgement(answer, seconds=0.03) for _ in sent]
 
     def seconds_of(sent: Any) -> float:
         return drawn[(sent if isinstance(sent, int) else sent[2].number) % len(drawn)]
@@ -238,10 +238,10 @@ def swept(
         RunDirectory.create(Path(folder) / "run") as run,
     ):
         sweep = Sweep(
-            job_of(config), run, watch or NullProgress(), SimulatedWorkers(pool)
+            load_job(config), run, watch or NullProgress(), SimulatedWorkers(pool)
         )
-        sweep.carry_out()
-        assert run.store.count(KIND) == sweep.total
+        sweep.execute()
+        assert run.store.count(KIND) == sweep.n_rows
         return pool.now, sweep.stages.seconds["sweep"], pool
 
 

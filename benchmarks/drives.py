@@ -36,10 +36,10 @@ import pandas as pd
 from advsearch.questions.explain.importance import find_importance
 from advsearch.rules import find_rules, split_in_halves
 from advsearch.statistics.clustered import (
-    fewer_by_chance,
+    compare_paired,
     mean_interval,
-    paired_by_unit,
-    share_interval,
+    one_sided_p_value,
+    rate_interval,
 )
 
 Floats = npt.NDArray[np.float64]
@@ -118,7 +118,7 @@ def intervals(runs: int) -> int:
             for _ in range(runs):
                 shown = np.arange(FRAMES) < rng.integers(1, FRAMES + 1, (drives, 1))
                 found.append(
-                    share_interval(
+                    rate_interval(
                         (answer(rng, drives, 0.8) & shown).sum(1), shown.sum(1)
                     )
                 )
@@ -128,7 +128,7 @@ def intervals(runs: int) -> int:
     for drives in DRIVES:
         rng = np.random.default_rng(drives)
         sizes = np.where(rng.random((runs, drives)) < 0.1, FRAMES, 1)
-        ends = np.array([share_interval(np.where(of == 1, 1, 0), of) for of in sizes])
+        ends = np.array([rate_interval(np.where(of == 1, 1, 0), of) for of in sizes])
         bad += report(
             "frames in view in few drives, which are wrong", drives, ends, 0.9
         )
@@ -167,7 +167,7 @@ def pairs(runs: int) -> int:
             ) -> bool:
                 one = answer(rng, len(units) // FRAMES, 0.8)  # noqa: B023
                 two = answer(rng, len(units) // FRAMES, other)  # noqa: B023
-                return paired_by_unit(one.ravel(), two.ravel(), units)[2] <= 0.05
+                return compare_paired(one.ravel(), two.ravel(), units)[2] <= 0.05
 
             errors = sum(told(0.8) for _ in range(runs))
             hits = sum(told(0.5) for _ in range(runs // 4))
@@ -185,7 +185,7 @@ def pairs(runs: int) -> int:
             first, second = np.zeros((2, drives, FRAMES), bool)
             first[lost], second[~lost, 0] = True, True
             errors += (
-                paired_by_unit(
+                compare_paired(
                     first.ravel(), second.ravel(), np.repeat(np.arange(drives), FRAMES)
                 )[2]
                 <= 0.05
@@ -219,7 +219,9 @@ def rules(runs: int) -> int:
                     )
                     right = right if less else answer(rng, drives, 0.8)  # noqa: B023
                     counts = (right & here, here, right & ~here, ~here)
-                    return fewer_by_chance(*(one.sum(axis=1) for one in counts)) <= 0.01
+                    return (
+                        one_sided_p_value(*(one.sum(axis=1) for one in counts)) <= 0.01
+                    )
 
                 errors = sum(told(0.0) for _ in range(runs))
                 hits = sum(told(0.4) for _ in range(runs // 10))

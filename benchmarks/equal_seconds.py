@@ -135,8 +135,8 @@ def searched(problem: Problem, predicted: bool, seconds: float) -> tuple[Tensor,
         steps=min(steps, MOST),
         seed=problem.seed,
         candidates=0 if predicted else 4,
-        late=lambda _: time.process_time() >= end,
-        noise=problem.seed,
+        is_out_of_time=lambda _: time.process_time() >= end,
+        render_seed=problem.seed,
     )
     return result.best_u, len(result.history)
 
@@ -147,7 +147,9 @@ def verified(problem: Problem, u: Tensor) -> float:
         Query(u, seeds.stream(problem.seed, "trial", one), spp=TRIAL_SPP)
         for one in range(TRIALS)
     ]
-    return statistics.fmean(problem.evaluate(query).said.margin for query in queries)
+    return statistics.fmean(
+        problem.evaluate(query).required_judgement.margin for query in queries
+    )
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ from advsearch.cli.main import main as advsearch
 from advsearch.report.wording import interval_text, number_text, percent
 from advsearch.runs.store import Row, Store
 from advsearch.runs.tables import units_of
-from advsearch.statistics.clustered import mean_interval, share_interval
+from advsearch.statistics.clustered import mean_interval, rate_interval
 from advsearch.statistics.sequential import ConfidenceSequence
 
 Interval = tuple[float, float]
@@ -254,7 +254,7 @@ def over_units(run: Path, rows: Sequence[Row]) -> Interval | None:
         mine.setdefault(unit, []).append(bool(row.correct))
     if max(map(len, mine.values())) < 2:
         return None
-    return share_interval(
+    return rate_interval(
         [sum(one) for one in mine.values()], [len(one) for one in mine.values()]
     )
 

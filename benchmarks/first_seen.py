@@ -38,7 +38,7 @@ from torch.nn.functional import max_pool2d
 
 import advsearch
 from advsearch.options import Outcome
-from advsearch.questions.sweep.display import distance_of, distance_sentence
+from advsearch.questions.sweep.display import distance_sentence, find_detection_distance
 from advsearch.questions.sweep.summary import AxisRow
 from advsearch.statistics.monotone import find_dips
 
@@ -165,7 +165,7 @@ def simulated(distances: Sequence[float], draws: int, tables: int) -> None:
             dips = find_dips(
                 distances, rng.binomial(draws, share), np.full(len(distances), draws)
             )
-            alarms += any(dip.is_shown for dip in dips)
+            alarms += any(dip.is_significant for dip in dips)
         print(f"{name}: said not to fall in {alarms / tables:.1%}")
 
 
@@ -253,7 +253,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 trials=0,
             ).summary
             rows = [row for row in summary.axes if row.axis == "camera.distance"]
-            seen = distance_of(summary)
+            seen = find_detection_distance(summary)
             said = "-" if seen is None else distance_sentence(seen)
             look = ", ".join(
                 f"{one:.0f}" for one in levels(light, args.look, args.size)

@@ -42,14 +42,14 @@ threads.configure()
 from advsearch.engine.gradients import (
     Bench,
     Loss,
-    interior_point,
+    find_interior_point,
+    make_smooth_loss,
     restrict_plan,
-    smooth_loss,
 )
 from advsearch.engine.loading import load_scene
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.scene.formation import EVERYTHING
+from advsearch.scene.formation import ALL_OMISSIONS
 from advsearch.scene.gradients import Group
 from advsearch.scene.renderer import Renderer
 
@@ -157,7 +157,7 @@ def compare_steps(size: int, repeats: int) -> int:
         )
         problem, _ = problem_from_config(config)
         renderer = problem.renderer
-        loss = problem.loss
+        loss = problem.compute_loss
         for group in renderer.plan.groups:
             if group.step_reason and group.size == 1:
                 cells = [f"{name}, {group.name}".ljust(32)]
@@ -230,10 +230,12 @@ def compare_denoised(size: int, repeats: int) -> int:
         )
         problem, _ = problem_from_config(config)
         renderer = problem.renderer
-        loss = problem.loss
+        loss = problem.compute_loss
         start = renderer.start * (1.0 - 2.0 * HALF) + HALF
         adjoint = restrict_plan(renderer.plan, {"texture.texels"}, "adjoint")
-        own = Bench(renderer, loss, start, seed=0, spp=256).gradient(adjoint, 999)
+        own = Bench(renderer, loss, start, seed=0, spp=256).compute_gradient(
+            adjoint, 999
+        )
         kinds = directions(own)
         for spp in (4, 16, 64, 256):
             seeds = max(FEWEST, min(repeats, 16 * repeats // spp))
@@ -336,14 +338,16 @@ def measure(
     """
     bench = Bench(
         renderer,
-        smooth_loss(renderer.formation.resolution),
-        interior_point(renderer),
+        make_smooth_loss(renderer.formation.resolution),
+        find_interior_point(renderer),
         seed=0,
         spp=64,
     )
     names = {group.name for group in renderer.plan.groups}
     differences = restrict_plan(renderer.plan, names, "differences")
-    references = [bench.gradient(differences, 1000 + number) for number in range(6)]
+    references = [
+        bench.compute_gradient(differences, 1000 + number) for number in range(6)
+    ]
     truth = torch.stack(references).mean(dim=0)
     for estimator in estimators:
         seconds = []
@@ -354,7 +358,7 @@ def measure(
             taken = "material"
         for number in range(repeats):
             begun = time.perf_counter()
-            gradient = replace(bench, spp=SPP).gradient(
+            gradient = replace(bench, spp=SPP).compute_gradient(
                 restrict_plan(renderer.plan, names, taken), number
             )
             seconds.append(time.perf_counter() - begun)
@@ -372,7 +376,7 @@ def take_projective(scene: Any) -> None:
     """Let Mitsuba's projective integrator, with guiding off, take the place of the
     material form.
     """
-    with_boundary = scene.like(leave_out=EVERYTHING - {"boundary"})
+    with_boundary = scene.like(leave_out=ALL_OMISSIONS - {"boundary"})
 
     def adjoint(
         inputs: dict[str, Tensor], cotangent: Tensor, seed: int, spp: int, **_: object

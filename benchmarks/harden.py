@@ -23,7 +23,12 @@ threads.configure()
 
 from advsearch.progress import watched
 from advsearch.questions.harden import harden
-from advsearch.questions.harden.result import HardenConfig, HardenResult, Share, shown
+from advsearch.questions.harden.result import (
+    HardenConfig,
+    HardenResult,
+    Share,
+    make_harden_view,
+)
 from advsearch.runs.directory import CONFIG, is_run
 from advsearch.settings import parse_assignment
 
@@ -52,7 +57,7 @@ def main() -> int:
         result = harden.run(
             config, progress=progress, resumed=args.run if there else None
         )
-    before_and_after = shown(result).sections[0]
+    before_and_after = make_harden_view(result).sections[0]
     print(" | ".join(before_and_after.heads))
     for row in before_and_after.rows:
         print(" | ".join(row))

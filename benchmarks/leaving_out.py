@@ -41,15 +41,20 @@ import torch
 from advsearch import seeds
 from advsearch.controls import CONTROLS, make_space
 from advsearch.controls.base import Parameter
-from advsearch.engine.acceptance import CHECK_SPP, levels_off
-from advsearch.engine.gradients import interior_point, smooth_loss
-from advsearch.engine.gradients.planning import bounces_of
-from advsearch.engine.loading import as_controls, framed, load_scene, make_renderer
+from advsearch.engine.acceptance import CHECK_SPP, compute_level_errors
+from advsearch.engine.gradients import find_interior_point, make_smooth_loss
+from advsearch.engine.gradients.planning import measure_problem_bounces
+from advsearch.engine.loading import (
+    fit_camera,
+    load_scene,
+    make_controls,
+    make_renderer,
+)
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.scene.formation import EVERYTHING, NOTHING
+from advsearch.scene.formation import ALL_OMISSIONS, NO_OMISSIONS
 from advsearch.scene.settings import FAMILIES, MATERIAL, SETTINGS
 from advsearch.scene.surface.renderer import SurfaceRenderer
 
@@ -145,7 +150,7 @@ def battery() -> int:
         (dict(zip(names, each, strict=True)), {})
         for each in itertools.product((0.0, 1.0), repeat=len(names))
     ]
-    for kind in sorted(CONTROLS.own):
+    for kind in sorted(CONTROLS.built_ins):
         parameters = [
             one
             for one in CONTROLS[kind].parameters
@@ -192,7 +197,7 @@ def ends_apart(
     everything left out and with nothing; where all are of a material, also where a
     control has the values.
     """
-    ways = (EVERYTHING, NOTHING)
+    ways = (ALL_OMISSIONS, NO_OMISSIONS)
     environment = "studio"
     still = {**controls, "lens": controls.get("lens", {})}
     found = [picture(thing, environment, fixed, still, leave, size) for leave in ways]
@@ -222,10 +227,10 @@ def picture(
     """The picture (H, W, 3) of a scene with settings, as it is, or with a control `at`
     other values.
     """
-    scene = framed(
+    scene = fit_camera(
         load_scene(thing, environment, settings=dict(settings)).description, size
     )
-    space = make_space(as_controls(dict(controls)), scene)
+    space = make_space(make_controls(dict(controls)), scene)
     renderer = make_renderer(scene, space, size, "none", 0, None, leave_out=leave_out)
     u = (
         renderer.start
@@ -242,11 +247,11 @@ def measured(
     """One pair: times, errors, gains."""
     problem = problem_of(pair, size, pair[2])
     lean = problem.renderer
-    u = interior_point(problem.renderer)
-    loss = smooth_loss((size, size))
-    full = lean.like(lean.scene.like(leave_out=NOTHING))
-    depth = bounces_of(problem, 0).depth
-    ways = [lean, full, lean.like(lean.scene.like(max_depth=depth))]
+    u = find_interior_point(problem.renderer)
+    loss = make_smooth_loss((size, size))
+    full = lean.copy_with(lean.scene.copy_with(leave_out=NO_OMISSIONS))
+    depth = measure_problem_bounces(problem, 0).depth
+    ways = [lean, full, lean.copy_with(lean.scene.copy_with(max_depth=depth))]
     truth = torch.stack(
         [
             one.gradient(loss, u, seeds.stream(1, "truth", n), 8 * spp)[1]
@@ -297,7 +302,7 @@ def predicted(size: int, spp: int, repeats: int) -> str:
                 kept.append(time.process_time() - begun)
             for kept, levels in zip(
                 squares,
-                levels_off(renderer, pictures, u, number, 4 * CHECK_SPP),
+                compute_level_errors(renderer, pictures, u, number, 4 * CHECK_SPP),
                 strict=True,
             ):
                 kept.append(levels**2)
@@ -319,13 +324,13 @@ def agreement(
     """
     problem = problem_of(pair, size, "texture,pose,camera")
     lean = problem.renderer
-    full = lean.like(lean.scene.like(leave_out=NOTHING))
-    depth = bounces_of(problem, 0).depth
+    full = lean.copy_with(lean.scene.copy_with(leave_out=NO_OMISSIONS))
+    depth = measure_problem_bounces(problem, 0).depth
     same = other = 0
     with torch.no_grad():
         for number in range(count):
             u = problem.domain.sample(torch.Generator().manual_seed(number))[0]
-            with lean.scene.shorter(depth):
+            with lean.scene.limit_depth(depth):
                 verdicts = [
                     int(problem.model(lean(u, noise, spp))[0].argmax())
                     for noise in (number, count + number)

@@ -133,7 +133,7 @@ def compared(renderer: Renderer) -> tuple[float, float]:
     weight = F.avg_pool2d(weight, 9, 1, 4)[0].permute(1, 2, 0)
     gradient = (
         sum(
-            scene.adjoint(inputs, weight, seed, SPP, wrt=[name])[name]
+            scene.render_adjoint(inputs, weight, seed, SPP, wrt=[name])[name]
             for seed in range(SEEDS)
         )
         / SEEDS
@@ -147,7 +147,7 @@ def compared(renderer: Renderer) -> tuple[float, float]:
         low, high = (
             torch.stack(
                 [
-                    (scene.radiance(one, 100 + seed, 4 * SPP) * weight).sum()
+                    (scene.render_radiance(one, 100 + seed, 4 * SPP) * weight).sum()
                     for seed in range(SEEDS)
                 ]
             ).mean()

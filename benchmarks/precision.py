@@ -27,7 +27,7 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.engine.gradients import interior_point, smooth_loss
+from advsearch.engine.gradients import find_interior_point, make_smooth_loss
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.precision import precision
 from advsearch.questions.precision.benches import (
@@ -223,29 +223,29 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
         samplers = dict.fromkeys(("multijitter", found.estimator.partition(" ")[0]))
         bench = PictureBench(
             renderer,
-            problem.whole(problem.domain.start),
+            problem.add_conditions(problem.domain.start),
             lambda picture: 1.0,
             list(samplers),
         )
     else:
-        renderer = renderer.like(denoiser="none", transfer="linear")
-        renderer.plan = renderer.plan.at_a_pixel()
+        renderer = renderer.copy_with(denoiser="none", transfer="linear")
+        renderer.plan = renderer.plan.with_pixel_steps()
         part = next(
             one
             for one in list_gradient_parts(renderer.plan.groups, linear=True)
             if one.name == found.control
         )
-        loss = smooth_loss(renderer.formation.resolution, config.seed)
-        bench = GradientBench(renderer, loss, interior_point(renderer), part)
+        loss = make_smooth_loss(renderer.formation.resolution, config.seed)
+        bench = GradientBench(renderer, loss, find_interior_point(renderer), part)
     bench.refer(budget, SEED, lambda: None)
     samples = [
         bench.measure(setting, SEED + number)[found.quantity]
         for number in range(REPEATS)
     ]
     point = summarize_samples(
-        setting, samples, floor=bench.floor(setting, found.quantity)
+        setting, samples, reference_error=bench.floor(setting, found.quantity)
     )
-    return point.rms, point.known
+    return point.rms, point.is_known
 
 
 if __name__ == "__main__":

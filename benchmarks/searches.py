@@ -114,7 +114,7 @@ def _answer(problem: Problem, policy: str, renders: int, seed: int) -> float:
         steps=steps,
         seed=seeds.stream(seed, policy),
         kind=policy,
-        noise=problem.seed,
+        render_seed=problem.seed,
     )
     return _verified(problem, found.best_u)
 
@@ -124,7 +124,9 @@ def _verified(problem: Problem, u: Tensor, trials: int = TRIALS) -> float:
         Query(u, seeds.stream(99, "trial", number), spp=TRIAL_SPP)
         for number in range(trials)
     ]
-    return statistics.fmean(problem.evaluate(query).said.margin for query in queries)
+    return statistics.fmean(
+        problem.evaluate(query).required_judgement.margin for query in queries
+    )
 
 
 def _spaces(args: argparse.Namespace) -> None:
@@ -214,7 +216,7 @@ def _transport(args: argparse.Namespace) -> None:
                 make_policy("auto"),
                 steps=args.renders,
                 seed=seeds.stream(seed, "auto"),
-                noise=problem.seed,
+                render_seed=problem.seed,
             )
             if seed:  # the first one compiles the renderer's code
                 seconds.append(time.process_time() - begun)

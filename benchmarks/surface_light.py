@@ -62,25 +62,25 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.engine.acceptance import (
-    VIEWS,
+    N_VIEWS,
     ComparedView,
     Deviation,
-    compared,
-    view_of,
+    compare_views,
+    compare_with_traced,
 )
 from advsearch.engine.loading import load_scene
 from advsearch.models import Model, load_model
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.recipe.description import planned, read_recipe
+from advsearch.questions.recipe.description import plan_runs, read_recipe
 from advsearch.questions.recipe.result import RecipeConfig
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.carry_out import load_job
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.result import SweepResult
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.renderer import SurfaceRenderer, why_not
+from advsearch.scene.surface.renderer import SurfaceRenderer, find_refusal
 
 SCENES = ("mug@studio", "bottle@studio", "bowl@kitchen")
 SPP = 8
@@ -160,7 +160,7 @@ def row(
 ) -> None:
     """Print what one scene at one size comes to."""
     height = renderer.formation.resolution[0]
-    reason = why_not(renderer, ["camera", "environment"])
+    reason = find_refusal(renderer, ["camera", "environment"])
     if reason is not None:
         print(f"{name:20s} {height:4d} not predicted: {reason}")
         return
@@ -170,7 +170,7 @@ def row(
     first = time.process_time() - begun
     wholes = views(renderer, args.views)
     inputs = [renderer.scene.assembly(renderer.space.inputs(one)) for one in wholes]
-    others = [milliseconds(lambda one=one: light.light(one)) for one in inputs]  # type: ignore[misc]
+    others = [milliseconds(lambda one=one: light.compute_light(one)) for one in inputs]  # type: ignore[misc]
     taken: tuple[list[float], list[float]] = ([], [])
     for number in range(args.repeats + 1):
         which = number % len(wholes)
@@ -233,9 +233,9 @@ def swept(scene: str, rows: int, label: str | None) -> None:
     found = list[SweepResult]()
     speeds = list[float]()
     for one in sweeps:
-        sweep = Sweep(job_of(one), None, NullProgress())
-        found.append(sweep.carry_out())
-        speeds.append(sweep.total / sweep.stages.seconds["sweep"])
+        sweep = Sweep(load_job(one), None, NullProgress())
+        found.append(sweep.execute())
+        speeds.append(sweep.n_rows / sweep.stages.seconds["sweep"])
     right = [[row.correct for row in one.rows()] for one in found]
     differ = [
         sum(a != b for a, b in zip(*pair, strict=True))
@@ -290,21 +290,21 @@ def ruled(scene: str, searches: int) -> None:
         shares = [list[float]() for _ in PLANTED]
         margins = list[float]()
         views_seen = 0
-        wholes = views(renderer, VIEWS * searches)
+        wholes = views(renderer, N_VIEWS * searches)
         for search in range(searches):
             seen = [
                 compare(
-                    renderer, light, wholes[VIEWS * search + n], search, model, label
+                    renderer, light, wholes[N_VIEWS * search + n], search, model, label
                 )
-                for n in range(VIEWS)
+                for n in range(N_VIEWS)
             ]
             for kind in range(len(PLANTED)):
                 column = [one[kind] for one in seen]
-                found = compared(column.__getitem__)
-                accepted[kind] += found.good
-                shares[kind].append(Deviation.of(column).share)
-                views_seen += found.pictures // 3 if kind == 0 else 0
-            margins += [one[0].margin for one in seen]
+                found = compare_views(column.__getitem__)
+                accepted[kind] += found.is_accepted
+                shares[kind].append(Deviation.from_views(column).levels_fraction)
+                views_seen += found.n_traced // 3 if kind == 0 else 0
+            margins += [one[0].margin_bias for one in seen]
         print(
             f"{scene}{name}: accepted of {searches} searches, and levels off as a "
             "share of the limit"
@@ -336,21 +336,23 @@ def compare(
     pictures.
     """
     inputs = renderer.scene.assembly(renderer.space.inputs(whole))
-    lit = light.light(inputs)
+    lit = light.compute_light(inputs)
     brighter = [
         replace(lit, on_object=lit.on_object * factor) for factor in (1.0, 1.1, 1.25)
     ]
     pictures = []
-    for light.fixed in brighter:
+    for light.fixed_light in brighter:
         pictures.append(light(whole))
-    light.fixed = None
+    light.fixed_light = None
     pictures += [pictures[0].roll(1, dims=1), pictures[0]]
     once: Any = Once(renderer)
     found = [
-        view_of(once, one, whole, search, SPP, lambda at, _: margin(model, at, label))
+        compare_with_traced(
+            once, one, whole, search, SPP, lambda at, _: margin(model, at, label)
+        )
         for one in pictures
     ]
-    return [*found[:-1], replace(found[-1], margin=found[-1].margin + 0.5)]
+    return [*found[:-1], replace(found[-1], margin_bias=found[-1].margin_bias + 0.5)]
 
 
 class Once:
@@ -358,7 +360,7 @@ class Once:
 
     def __init__(self, renderer: Renderer) -> None:
         self.mask = lru_cache(renderer.mask)
-        self.halves = lru_cache(renderer.halves)
+        self.halves = lru_cache(renderer.render_halves)
         self.__call = lru_cache(renderer.__call__)
 
     def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
@@ -373,15 +375,15 @@ def simulated(searches: int = 4000) -> None:
 
     def accepts(share: float, bias: float, spread: float, deviation: float) -> str:
         sigma = math.sqrt(math.log(1.0 + spread**2))
-        normal = generator.normal(size=(2, searches, VIEWS))
+        normal = generator.normal(size=(2, searches, N_VIEWS))
         squares = share**2 * np.exp(sigma * normal[0] - sigma**2 / 2.0)
         moved = bias + deviation * normal[1]
         good = sum(
-            compared(
+            compare_views(
                 lambda n, one=one: ComparedView(
                     16.0 * float(squares[one, n]), 16.0, float(moved[one, n]), 3
                 )
-            ).good  # type: ignore[misc]
+            ).is_accepted  # type: ignore[misc]
             for one in range(searches)
         )
         return f"{100.0 * good / searches:5.1f}"
@@ -421,7 +423,7 @@ def searched(thing: str, environment: str, size: int) -> None:
     )
     (config,) = [
         one.config
-        for one in planned(read_recipe("viewpoints"), asked)
+        for one in plan_runs(read_recipe("viewpoints"), asked)
         if one.part == "search"
     ]
     assert isinstance(config, AttackConfig)

@@ -32,16 +32,16 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.controls import Space
-from advsearch.engine.loading import as_controls, framed, load_scene
+from advsearch.engine.loading import fit_camera, load_scene, make_controls
 from advsearch.models import load_model
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import job as swept_scene
-from advsearch.questions.sweep.axes import read_axes
+from advsearch.questions.sweep.axes import parse_axes
 from advsearch.questions.sweep.job import Job, NamedScene
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.scene.formation import EVERYTHING, ImageFormation
+from advsearch.scene.formation import ALL_OMISSIONS, ImageFormation
 from advsearch.scene.gradients import GradientPlan
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
@@ -179,8 +179,8 @@ def loop(config: SweepConfig, model, watch) -> float:  # type: ignore[no-untyped
     ):
         sweep = Sweep(job, run, watch)
         begun = time.perf_counter()
-        sweep.carry_out()
-        return sweep.total / (time.perf_counter() - begun)
+        sweep.execute()
+        return sweep.n_rows / (time.perf_counter() - begun)
 
 
 def resident() -> int:
@@ -197,8 +197,8 @@ def resident() -> int:
 
 
 def job_of(config: SweepConfig, model) -> Job:  # type: ignore[no-untyped-def]
-    drawn = as_controls(config.controls)
-    axes = read_axes(config.grid, drawn)
+    drawn = make_controls(config.controls)
+    axes = parse_axes(config.grid, drawn)
     place = NamedScene("mug", "studio", load_scene("mug", "studio"))
     task = Classification().on(model)
     return Job(config, (place,), (model,), (task,), drawn, axes)
@@ -221,10 +221,10 @@ def against_bare(size: int, pictures: int, turns: int) -> tuple[float, float, fl
         for turn in range(turns + 1):
             with RunDirectory.create(Path(folder) / str(turn)) as run:
                 sweep = Sweep(job, run, NullProgress())
-                sweep.carry_out()
+                sweep.execute()
                 seconds = sweep.stages.seconds["sweep"]
             if turn:
-                ratios.append(bare.turn(sweep.total) / seconds)
+                ratios.append(bare.turn(sweep.n_rows) / seconds)
             else:
                 bare.turn(16)
     low, middle, high = statistics.quantiles(ratios, n=4)
@@ -242,22 +242,22 @@ class Bare:
     def __init__(self, job: Job, size: int) -> None:
         self.job = job
         self.size = (size, size)
-        self.space = job.space(job.places[0], self.size)
-        self.description = framed(job.places[0].scene.description, self.size)
+        self.space = job.bind_controls(job.scenes[0], self.size)
+        self.description = fit_camera(job.scenes[0].scene.description, self.size)
         self.formation = ImageFormation(
             resolution=self.size, gain=self.description.gain
         )
         self.scene = MitsubaScene(
             self.space.scene or self.description,
             self.size,
-            leave_out=EVERYTHING - {"tracing"},
+            leave_out=ALL_OMISSIONS - {"tracing"},
         )
 
     def turn(self, count: int) -> float:
         """Render and classify so many pictures; return the seconds."""
         job = self.job
-        points = self.job.points(self.space)
-        u = points.configurations(0, count)
+        points = self.job.make_points(self.space)
+        u = points.make_configurations(0, count)
         inputs = [self.scene.assembly(self.space.inputs(one)) for one in u]
         begun = time.perf_counter()
         with torch.no_grad():
@@ -269,8 +269,8 @@ class Bare:
         return time.perf_counter() - begun
 
     def picture(self, inputs, seed: int, spp: int) -> Tensor:  # type: ignore[no-untyped-def]
-        radiance = self.scene.radiance(inputs, seed, spp)
-        albedo, normal = self.scene.guides(inputs, seed, spp)
+        radiance = self.scene.render_radiance(inputs, seed, spp)
+        albedo, normal = self.scene.render_guides(inputs, seed, spp)
         return self.formation.display(
             denoise(radiance[..., :3].contiguous(), albedo, normal)
         )

@@ -117,13 +117,13 @@ def times(renderer: Renderer, loss: Callable[[Tensor], Tensor], repeats: int) ->
         "  making the matrix, in rendered steps             "
         f"{middle['making'] / middle['rendered']:8.2f}"
     )
-    print(f"  entries {linear.entries:,}, {linear.bytes / 2**20:.0f} MiB")
+    print(f"  entries {linear.n_entries:,}, {linear.n_bytes / 2**20:.0f} MiB")
 
 
 def errors(renderer: Renderer) -> None:
     """Print how far predicted changes are off."""
     linear = LinearRenderer(renderer, renderer.start, seed=1)
-    undenoised = renderer.like(denoiser="none")
+    undenoised = renderer.copy_with(denoiser="none")
 
     def traced(u: Tensor, seed: int) -> Tensor:
         """Radiance of `TRACED` samples."""

@@ -27,8 +27,13 @@ from torch import Tensor, nn
 
 from advsearch import seeds
 from advsearch.controls import compose
-from advsearch.engine.loading import as_controls, framed, load_scene, make_renderer
-from advsearch.scene.color import to_8_bit
+from advsearch.engine.loading import (
+    fit_camera,
+    load_scene,
+    make_controls,
+    make_renderer,
+)
+from advsearch.scene.color import round_to_8_bit
 
 SIDE = 32
 FOV = 35.0
@@ -69,8 +74,8 @@ def pictures(count: int, seed: int) -> tuple[Tensor, Tensor]:
     """Return pictures (N, 3, SIDE, SIDE) of the mug, and its bearing in each, (N, 1) in
     radians to the left.
     """
-    description = framed(load_scene("mug").description, SIDE)
-    space = compose(as_controls(ANYWHERE), description)
+    description = fit_camera(load_scene("mug").description, SIDE)
+    space = compose(make_controls(ANYWHERE), description)
     renderer = make_renderer(
         description, space, SIDE, "none", seed, differentiated=False
     )
@@ -88,7 +93,9 @@ def pictures(count: int, seed: int) -> tuple[Tensor, Tensor]:
         )
         radiance = renderer.radiance(u, seeds.stream(seed, f"picture {len(seen)}"), SPP)
         seen.append(
-            to_8_bit(space.picture(u, renderer.formation.display(radiance)))
+            round_to_8_bit(
+                space.apply_to_image(u, renderer.formation.display(radiance))
+            )
             .permute(2, 0, 1)
             .clone()
         )

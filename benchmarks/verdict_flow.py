@@ -46,8 +46,8 @@ from advsearch.attacks.verification import (
     WORST_CASE,
     Rule,
 )
-from advsearch.engine.journal import Journal, Shared
-from advsearch.engine.record import Findings
+from advsearch.engine.journal import Journal, ParallelEvaluator
+from advsearch.engine.record import RunState
 from advsearch.engine.verifier import Verifier
 from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack.stages import verify_searches
@@ -101,7 +101,7 @@ class Drawn:
         drawn = np.random.default_rng(
             [self.root, query.seed, query.spp, round(1000 * at)]
         ).normal(size=1)
-        if self.over and query.drawn:
+        if self.over and query.draws_conditions:
             shared = np.random.default_rng([self.root, query.seed]).normal()
             return _judged(self._middle + math.sqrt(0.5) * (shared + float(drawn[0])))
         return _judged(self._middle + float(drawn[0]))
@@ -138,24 +138,27 @@ def checked(
     over: bool = False,
     beside: bool = True,
     failures: int = 0,
-) -> Findings:
+) -> RunState:
     """Return what an attack's own check comes to, with a random search `beside` it, and
     so many different failures.
     """
     problem: Any = Drawn(rate, root, over)
     looks = OVER_LOOKS if over else TRIAL_LOOKS
     verifier = Verifier(
-        Journal(None, Shared(problem)), LADDER, Stages(NullProgress()), looks=looks
+        Journal(None, ParallelEvaluator(problem)),
+        LADDER,
+        Stages(NullProgress()),
+        looks=looks,
     )
     listed = tuple(
         FoundFailure(torch.full((1,), FAILURE + 0.01 * k), 1.0, {})
         for k in range(failures)
     )
     known = Failures(listed, (0,), failures, failures, failures) if failures else None
-    verifier.findings.search = claimed(OWN, known)
-    verifier.findings.baseline = claimed(BASELINE) if beside else None
+    verifier.state.search = claimed(OWN, known)
+    verifier.state.baseline = claimed(BASELINE) if beside else None
     verify_searches(verifier, is_smallest=False)
-    return verifier.findings
+    return verifier.state
 
 
 def flow(
@@ -168,7 +171,7 @@ def flow(
     for root in range(runs):
         findings = checked(rate, root, over=over, beside=beside)
         assert findings.verification is not None
-        low, high = findings.verification.adversarial.interval
+        low, high = findings.verification.adversarial_counts.interval
         found += findings.verification.ending is Ending.FOUND
         covered += low <= rate <= high
         pictures += findings.verification_renders
@@ -208,7 +211,9 @@ def failures_table(runs: int) -> int:
     held = 0
     for root in range(-(-runs // count)):
         findings = checked(RATE, root, beside=False, failures=count)
-        held += sum(one.ending is Ending.FOUND for one in findings.failures)
+        held += sum(
+            one.ending is Ending.FOUND for one in findings.failure_verifications
+        )
     tried = count * -(-runs // count)
     print(
         f"of {tried} different failures of {RATE} {100 * held / tried:.2f} % are "

@@ -58,7 +58,7 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.evaluation import Evaluate
-from advsearch.attacks.trials import LADDER, MarginsOf, Trials, margins_of
+from advsearch.attacks.trials import LADDER, MarginsOf, Trials, make_margin_function
 from advsearch.attacks.verification import (
     OVER_CONDITIONS,
     OVER_CONFIDENCE,
@@ -102,7 +102,9 @@ def ended(script: str) -> Verification:
             if answer is None:
                 raise Unknown
             score = 1.0 if answer == "1" else -1.0
-            yield Evaluation.of(Judgement(score, -score, score <= 0.0, Prediction("")))
+            yield Evaluation.from_judgement(
+                Judgement(score, -score, score <= 0.0, Prediction(""))
+            )
 
     domain = Domain(torch.zeros(1), (Block(1, "linf", 1.0),))
     return verify(
@@ -130,7 +132,7 @@ def paths() -> dict[tuple[int, int, bool], int]:
         except Unknown:
             scripts += [script + "0", script + "1"]
             continue
-        rate = said.adversarial
+        rate = said.adversarial_counts
         ways[rate.successes, rate.trials, said.ending is Ending.FOUND] += 1
     return dict(ways)
 
@@ -152,7 +154,7 @@ def found(rate: float) -> float:
 
 def found_before(rate: float) -> float:
     """Return how often a rate was found by 19 of 20."""
-    return float(stats.binom.sf(WORST_CASE.needed(20) - 1, 20, rate))
+    return float(stats.binom.sf(WORST_CASE.count_needed(20) - 1, 20, rate))
 
 
 def coverage(rate: float) -> float:
@@ -192,7 +194,7 @@ def over_outcomes(
     (n,), and whether that is found; of `OVER_LOOKS[-1]` trials so many count.
     """
     last = min(counting, OVER_LOOKS[-1])
-    lost = OVER_CONDITIONS.allowed(OVER_LOOKS[-1])
+    lost = OVER_CONDITIONS.count_allowed_failures(OVER_LOOKS[-1])
     failing = {0: np.ones_like(rates)}
     ended = dict[tuple[int, int], tuple[Array, bool]]()
     for n in range(1, last + 1):
@@ -204,9 +206,9 @@ def over_outcomes(
         failing = {}
         for failures, chance in went.items():
             early = n in OVER_LOOKS and n < last
-            found = (early or n == last) and n - failures >= OVER_CONDITIONS.needed(
-                n, early=early
-            )
+            found = (
+                early or n == last
+            ) and n - failures >= OVER_CONDITIONS.count_needed(n, early=early)
             if found or n == last or failures > lost:
                 ended[n - failures, n] = chance, found
             else:
@@ -242,7 +244,7 @@ def over_table() -> int:
         (chance * n for (_, n), (chance, _) in ends.items()), np.zeros_like(rates)
     )
     for rate, chance, count in zip(rates, chances, trials, strict=True):
-        before = stats.binom.sf(OVER_CONDITIONS.needed(200) - 1, 200, rate)
+        before = stats.binom.sf(OVER_CONDITIONS.count_needed(200) - 1, 200, rate)
         print(
             f"| {rate:.2f} | {100 * before:.2f} | {100 * chance:.2f} | 200 | "
             f"{count:.0f} |"
@@ -393,7 +395,9 @@ def verdict(
     before or as it is.
     """
     at = {"adversarial": domain.project(u), "clean": domain.start}
-    margins = {name: margins_of(evaluate, name, place) for name, place in at.items()}
+    margins = {
+        name: make_margin_function(evaluate, name, place) for name, place in at.items()
+    }
     trials: tuple[int, ...] = (20,) if before else TRIAL_LOOKS
     if before:
         spp = choose_before(list(margins.values()), seed)
@@ -491,7 +495,7 @@ def rendered_table(config: AttackConfig, epsilons: Sequence[float]) -> None:
         for before in (True, False):
             evaluate = Counted(problem.evaluate)
             said = verdict(evaluate, problem.domain, answer.best_u, 0, before=before)
-            rate = said.adversarial
+            rate = said.adversarial_counts
             what = said.ending.value, f"{rate.successes}/{rate.trials} at {rate.spp}"
             for column, text in zip(
                 told,

@@ -21,8 +21,8 @@ from torch import Tensor
 from advsearch import load_scene
 from advsearch.catalog import list_built_ins
 from advsearch.controls import make_space
-from advsearch.engine.loading import as_controls, make_renderer
-from advsearch.scene.color import to_8_bit
+from advsearch.engine.loading import make_controls, make_renderer
+from advsearch.scene.color import round_to_8_bit
 
 FOLDER = Path(__file__).resolve().parent / "images" / "controls"
 SPP = 128
@@ -124,14 +124,14 @@ def row(name: str, size: int) -> Image.Image:
     spec, environment, given = SCENES.get(name, ("mug", None, {}))
     scene = load_scene(spec, environment, settings=given, things=BESIDE.get(name))
     controls = dict(CONTROLS.get(name, {name: {}}))
-    space = make_space(as_controls(controls), scene.description)
+    space = make_space(make_controls(controls), scene.description)
     render = make_renderer(scene.description, space, size, "oidn", 0)
     pictures = [
         render.start,
         *(_example(space.start, space.groups, number) for number in range(1, 4)),
     ]
     with torch.no_grad():
-        shown = [to_8_bit(render(u, seed=0, spp=SPP)) for u in pictures]
+        shown = [round_to_8_bit(render(u, seed=0, spp=SPP)) for u in pictures]
     gap = torch.ones(size, 6, 3)
     strip = torch.cat(
         [part for picture in shown for part in (picture, gap)][:-1], dim=1

@@ -33,7 +33,7 @@ from advsearch.questions.attack.summary import AttackSummary, CurveResult, Matri
 from advsearch.questions.compare.result import CompareResult
 from advsearch.questions.explain.result import ExplainResult
 from advsearch.questions.harden.result import HardenResult
-from advsearch.questions.recipe.description import recipe_names as recipe_names
+from advsearch.questions.recipe.description import list_recipes as recipe_names
 from advsearch.questions.region.result import RegionResult
 from advsearch.questions.replay.result import ReplayResult
 from advsearch.questions.stability.result import CaseRow
@@ -276,7 +276,7 @@ def controls(record: Record) -> str:
 
     rows = []
     below = ""
-    for kind in CONTROLS.own:
+    for kind in CONTROLS.built_ins:
         place = f"{kind}.md" if (f"controls/{kind}.md", kind) in PARTS else f"#{kind}"
         drawn = (DOCS / "images" / "controls" / f"{kind}.png").is_file()
         picture = f"![{kind}](../images/controls/{kind}.png)" if drawn else ""
@@ -510,9 +510,9 @@ def stored_record() -> dict[str, Any]:
     """Return the record that lies beside the weights in the package; empty if the model
     has not been trained yet.
     """
-    from advsearch.models.reference import RECORD, data_folder
+    from advsearch.models.reference import RECORD, get_data_folder
 
-    path = data_folder() / RECORD
+    path = get_data_folder() / RECORD
     return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
 
 
@@ -749,7 +749,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("controls/README.md", "controls"): controls,
     **{
         (f"controls/{kind}.md", kind): control(kind)
-        for kind in CONTROLS.own
+        for kind in CONTROLS.built_ins
         if (DOCS / "controls" / f"{kind}.md").is_file()
     },
     ("policies/pgd.md", "pgd"): policy("pgd"),

@@ -20,7 +20,7 @@ from advsearch.cli.output import shown_text as text_of
 from advsearch.questions.attack.summary import (
     AttackSummary,
     PicturedPrediction,
-    attack_of,
+    load_attack_summary,
 )
 from advsearch.report.wording import CLASSIFICATION, prediction_text
 from advsearch.runs.directory import default_name
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "run", type=Path, help="folder of a finished run with the control texture"
     )
     run = parser.parse_args(argv).run
-    summary = attack_of(run)
+    summary = load_attack_summary(run)
     side_by_side(run, summary).save(PICTURE, optimize=True)
     readme = ROOT / "README.md"
     readme.write_text(

@@ -23,9 +23,13 @@ from PIL import Image
 
 import advsearch
 from advsearch.questions.recipe import recipe
-from advsearch.questions.recipe.carry_out import NOTE
+from advsearch.questions.recipe.carry_out import RECIPE_NOTE
 from advsearch.questions.recipe.description import read_recipe
-from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, told_once
+from advsearch.questions.recipe.result import (
+    RecipeConfig,
+    RecipeResult,
+    omit_repeated_sentences,
+)
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
@@ -186,15 +190,18 @@ def renew(name: str, run: Path) -> None:
     """
     if done(run):
         with Store(run / STORE) as store:
-            kept = {**(store.noted(NOTE) or {}), "figures": read_recipe(name).figures}
-            store.set_note(NOTE, json.dumps(kept))
+            kept = {
+                **(store.noted(RECIPE_NOTE) or {}),
+                "figures": read_recipe(name).figures,
+            }
+            store.set_note(RECIPE_NOTE, json.dumps(kept))
         gone_on(run)
 
 
 def told(name: str, result: RecipeResult, suffix: str) -> dict[str, Any]:
     """Copy the figures that are shown, and return what there is to tell."""
     figures = []
-    texts = told_once(result.figures)
+    texts = omit_repeated_sentences(result.figures)
     for number in SHOWN[name]:
         image = IMAGES / "-".join(filter(None, [name, suffix, f"{number}.png"]))
         image.parent.mkdir(parents=True, exist_ok=True)

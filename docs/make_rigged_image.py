@@ -21,7 +21,7 @@ import torch
 from PIL import Image
 
 import advsearch
-from advsearch.scene.color import to_8_bit
+from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.glb import GlbBuffer
 
 PICTURE = Path(__file__).resolve().parent / "images" / "rigged.webp"
@@ -77,7 +77,7 @@ def write_lamp(path: Path) -> None:
     ]
     for number, profile in enumerate((base, neck, shade)):
         points, faces = lathe(profile)
-        corners = {"POSITION": made.accessor(points, "VEC3", bounds=True)}
+        corners = {"POSITION": made.add_accessor(points, "VEC3", bounds=True)}
         if profile is neck:
             # a joint's share falls to none over the length of a bone
             at = points[:, 1] / BONE
@@ -86,12 +86,12 @@ def write_lamp(path: Path) -> None:
             )
             shares[:, 0][at < 0.5], shares[:, -1][at > JOINTS - 0.5] = 1.0, 1.0
             shares /= shares.sum(axis=1, keepdims=True)
-            corners["JOINTS_0"] = made.accessor(
+            corners["JOINTS_0"] = made.add_accessor(
                 np.tile(np.arange(JOINTS, dtype=np.uint16), (len(points), 1)), "VEC4"
             )
-            corners["WEIGHTS_0"] = made.accessor(shares.astype(np.float32), "VEC4")
+            corners["WEIGHTS_0"] = made.add_accessor(shares.astype(np.float32), "VEC4")
         meshes.append({
-            "primitives": [{"attributes": corners, "indices": made.accessor(faces, "SCALAR"), "material": number}]
+            "primitives": [{"attributes": corners, "indices": made.add_accessor(faces, "SCALAR"), "material": number}]
         })  # fmt: skip
     inverse = np.tile(np.eye(4, dtype=np.float32), (JOINTS, 1, 1))
     inverse[:, 3, 1] = -BONE * np.arange(JOINTS)  # columns come first
@@ -117,15 +117,18 @@ def write_lamp(path: Path) -> None:
         turn = np.zeros((3, 4), np.float32)
         # towards +z, the front
         turn[:, 0], turn[:, 3] = np.sin(half[joint]), np.cos(half[joint])
-        output = made.accessor(turn, "VEC4")
+        output = made.add_accessor(turn, "VEC4")
         samplers.append(
-            {"input": made.accessor(times, "SCALAR", bounds=False), "output": output}
+            {
+                "input": made.add_accessor(times, "SCALAR", bounds=False),
+                "output": output,
+            }
         )
     colors = ([0.05, 0.05, 0.06, 1.0], [0.5, 0.5, 0.52, 1.0], [0.55, 0.08, 0.05, 1.0])
-    path.write_bytes(made.file({
+    path.write_bytes(made.to_bytes({
         "asset": {"version": "2.0", "generator": "docs/make_rigged_image.py"},
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": nodes, "meshes": meshes,
-        "skins": [{"joints": [3, 4, 5, 6], "inverseBindMatrices": made.accessor(inverse.reshape(-1, 16), "MAT4")}],
+        "skins": [{"joints": [3, 4, 5, 6], "inverseBindMatrices": made.add_accessor(inverse.reshape(-1, 16), "MAT4")}],
         "materials": [
             {"name": name, "pbrMetallicRoughness": {"baseColorFactor": color, "metallicFactor": metal}}
             for name, color, metal in zip(("base", "neck", "shade"), colors, (0.0, 0.6, 0.0), strict=True)
@@ -169,7 +172,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 {"camera": {"roll": [-1, 1]}, "body": dict(pose)}, resolution=args.size
             )
             with torch.no_grad():
-                pictures.append(to_8_bit(render(render.start, 0, 128)))
+                pictures.append(round_to_8_bit(render(render.start, 0, 128)))
     levels = (torch.cat(pictures, dim=1) * 255.0).round().byte().numpy()
     Image.fromarray(levels).save(PICTURE, quality=84, method=6)
     print(

@@ -17,8 +17,8 @@ from PIL import Image
 
 from advsearch import load_scene
 from advsearch.controls import Space
-from advsearch.engine.loading import framed, make_renderer
-from advsearch.scene.color import to_8_bit
+from advsearch.engine.loading import fit_camera, make_renderer
+from advsearch.scene.color import round_to_8_bit
 
 IMAGES = Path(__file__).resolve().parent / "images"
 VIEWS = (
@@ -39,10 +39,10 @@ def picture(
     """One picture of a height and width."""
     scene = load_scene(name, light, settings=settings)
     renderer = make_renderer(
-        framed(scene.description, size), Space(()), size, "oidn", 0
+        fit_camera(scene.description, size), Space(()), size, "oidn", 0
     )
     with torch.no_grad():
-        levels = to_8_bit(renderer(renderer.start, 0, spp)) * 255.0
+        levels = round_to_8_bit(renderer(renderer.start, 0, spp)) * 255.0
     return Image.fromarray(levels.round().byte().numpy())
 
 

@@ -25,7 +25,7 @@ import torch
 from PIL import Image, ImageOps
 
 import advsearch
-from advsearch.scene.color import linear_to_srgb, to_8_bit
+from advsearch.scene.color import linear_to_srgb, round_to_8_bit
 
 IMAGES = Path(__file__).resolve().parent / "images"
 COLUMNS = 4
@@ -346,7 +346,7 @@ def rendered(one: Asked, size: int, spp: int) -> Image.Image:
     still = {"camera": {"roll": [-1.0, 1.0]}}
     render = loaded.renderer({**still, **one.controls}, resolution=size)
     with torch.no_grad():
-        levels = to_8_bit(render(render.start, 0, spp)) * 255.0
+        levels = round_to_8_bit(render(render.start, 0, spp)) * 255.0
     picture = Image.fromarray(levels.round().byte().numpy())
     view = one.scene["settings"]
     # as large as from 10 m, from where it is

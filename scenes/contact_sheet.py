@@ -19,7 +19,7 @@ import numpy.typing as npt
 from advsearch.questions.harden.objects import HOUSEHOLD, OBJECTS
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.parts import mesh_part
+from advsearch.scene.parts import make_mesh_part
 from scenes.environments import ENVIRONMENTS
 
 Floats = npt.NDArray[np.float32]
@@ -41,10 +41,13 @@ def picture(
     import torch
 
     from advsearch.scene.mitsuba_backend.denoise import denoise
-    from advsearch.scene.mitsuba_backend.meshes import mitsuba_mesh, principled
-    from advsearch.scene.mitsuba_backend.variant import mitsuba
+    from advsearch.scene.mitsuba_backend.meshes import (
+        make_mitsuba_mesh,
+        make_principled,
+    )
+    from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 
-    mi = mitsuba()
+    mi = import_mitsuba()
     transform = mi.ScalarTransform4f
     low = asset.mesh.vertices.min(axis=0)
     high = asset.mesh.vertices.max(axis=0)
@@ -53,7 +56,7 @@ def picture(
     a = np.radians(azimuth)
     e = np.radians(elevation)
     away = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    whole = mesh_part(asset.name, asset, np.eye(4), asset.material)
+    whole = make_mesh_part(asset.name, asset, np.eye(4), asset.material)
     fov = 35.0
     eye = middle + away * radius * 1.02 / np.sin(np.radians(fov / 2))
     scene = mi.load_dict(
@@ -90,8 +93,8 @@ def picture(
                     "reflectance": {"type": "rgb", "value": [0.2, 0.13, 0.08]},
                 },
             },
-            "object": mitsuba_mesh(
-                asset.name, asset.mesh, np.eye(4), principled(whole)
+            "object": make_mitsuba_mesh(
+                asset.name, asset.mesh, np.eye(4), make_principled(whole)
             ),
         }
     )

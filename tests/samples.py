@@ -9,7 +9,7 @@ import numpy as np
 import OpenEXR
 
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult, attack_of
+from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult, load_attack_summary
 from advsearch.questions.region.result import RegionResult
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import RunDirectory
@@ -227,7 +227,7 @@ def keep_object(run: Path) -> None:
     """Put the mug, and the same painted black and white, among what a run has to turn."""
     from advsearch.runs.directory import OBJECT_FILE
     from advsearch.scene.assets import Shape
-    from advsearch.scene.glb import web_glb
+    from advsearch.scene.glb import encode_web_glb
     from advsearch.scene.library import load_object
 
     mug = load_object("mug")
@@ -238,9 +238,9 @@ def keep_object(run: Path) -> None:
         Shape("object", mug.mesh, color.astype(np.float32), mug.material) for color in (mug.base_color, squares)
     )
     (run / OBJECT_FILE).parent.mkdir(parents=True, exist_ok=True)
-    (run / OBJECT_FILE).write_bytes(web_glb([painted], [clean], camera, "It has fewer faces here."))
+    (run / OBJECT_FILE).write_bytes(encode_web_glb([painted], [clean], camera, "It has fewer faces here."))
 
 
 def written_page(run: Path) -> Path:
     """Write the page of an attack and return its path."""
-    return write_page(run, attack_of(run))
+    return write_page(run, load_attack_summary(run))

@@ -11,8 +11,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from advsearch.cluster import DEATHS, WorkerDiedError, WorkerExecutor, WorkerStats, WorkerTask
-from advsearch.cluster.worker import Reply, this_machine
+from advsearch.cluster import MAX_DEATHS, WorkerDiedError, WorkerExecutor, WorkerStats, WorkerTask
+from advsearch.cluster.worker import Reply, describe_machine
 from advsearch.cluster.workers import PoolWorkers
 
 
@@ -50,7 +50,7 @@ class Simulated(WorkerExecutor):
     now: float = 0.0
     given: list[Any] = field(default_factory=list)
     most: int = 0
-    where: str = "simulated"
+    description: str = "simulated"
     stats: WorkerStats = field(default_factory=WorkerStats)
     _events: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
     _workers: dict[str, SimulatedCall | None] = field(default_factory=dict)
@@ -94,11 +94,11 @@ class Simulated(WorkerExecutor):
             return
         self.stats.lost += 1
         call.deaths += 1
-        if call.deaths < DEATHS:
+        if call.deaths < MAX_DEATHS:
             self._waiting.appendleft(call)
             self._give_out()
         else:
-            call.future.set_exception(WorkerDiedError(f"no answer: {DEATHS} workers died of it"))
+            call.future.set_exception(WorkerDiedError(f"no answer: {MAX_DEATHS} workers died of it"))
 
     def lose_scheduler(self) -> None:
         """What is under way is lost; the workers come back."""
@@ -142,7 +142,7 @@ class Simulated(WorkerExecutor):
                 return  # it died
             self._workers[worker] = None
             self._idle.append(worker)
-            reply = Reply(self.call(call.items), seconds, loading, this_machine(), worker)
+            reply = Reply(self.call(call.items), seconds, loading, describe_machine(), worker)
             if call.future.set_running_or_notify_cancel():
                 call.future.set_result(self.replies.get(worker, reply))
             self._give_out()

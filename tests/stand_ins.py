@@ -17,13 +17,13 @@ from torch import Tensor
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, make_policy
 from advsearch.attacks.verification import WORST_CASE, Rule
 from advsearch.cluster import BatchResult, InProcess, WorkerStats, WorkerTask
-from advsearch.engine.journal import Journal, Shared
+from advsearch.engine.journal import Journal, ParallelEvaluator
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings
-from advsearch.engine.verifier import ladder_of
+from advsearch.engine.record import RunState
+from advsearch.engine.verifier import choose_ladder
 from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.attack.carry_out import attack_worker, search_size
+from advsearch.questions.attack.carry_out import attack_worker, choose_search_size
 from advsearch.questions.attack.run import search_and_verify
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
@@ -76,13 +76,13 @@ class StandInProblem:
     def evaluate(self, query: Query) -> Evaluation:
         time.sleep(self.pause)
         if query.phase is None:
-            return Evaluation.of(judged(self._logits(query.u, query.seed)))
+            return Evaluation.from_judgement(judged(self._logits(query.u, query.seed)))
         self.on_evaluation()
         at = query.u.clone().requires_grad_()
         logits = self._logits(at, query.seed)
         value = logits[1] - logits[0]
         slope = torch.autograd.grad(value, at)[0] if query.gradient else None
-        picture = torch.full((2, 2, 3), float(query.u.mean())) if query.keep else None
+        picture = torch.full((2, 2, 3), float(query.u.mean())) if query.with_image else None
         said = judged(logits.detach())
         return Evaluation(
             float(value.detach()), slope, bool(value > 0), cost=query.samples, judgement=said, picture=picture
@@ -107,26 +107,26 @@ def attack_on(
     policy: Policy[Any],
     stages: Stages,
     run: RunDirectory | None = None,
-) -> Findings:
+) -> RunState:
     """Attack a problem of one's own as a configuration describes it."""
-    problem.steps, problem.draws = search_size(config, problem)
+    problem.steps, problem.draws = choose_search_size(config, problem)
     return search_and_verify(
         policy,
-        Journal(run, Shared(problem)),
+        Journal(run, ParallelEvaluator(problem)),
         stages,
         smallest=config.smallest,
         seconds=config.seconds,
         baseline=config.baseline,
-        close_looks=config.close_looks,
+        close_looks=config.max_extra_repeats,
         average=config.average,
         trials=config.trial_count if config.trials is not None or config.smallest else None,
-        ladder=ladder_of(config.verify_spp, config.pixel_sampler),
+        ladder=choose_ladder(config.verify_spp, config.pixel_sampler),
         specialise=config.specialise,
         measure=config.measure,
     )
 
 
-def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume: bool = False) -> Findings:
+def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume: bool = False) -> RunState:
     """Carry out the attack in a folder, from the beginning or from where it is."""
     problem: Any = StandInProblem(pause)
     with RunDirectory.resume(folder) if resume else RunDirectory.create(folder, config=config) as run:
@@ -200,7 +200,7 @@ class StandInWorkers:
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         """The latest comes first."""
         first, listed = len(self.given), list(batches)
-        for place, done in enumerate(self.made.results(reversed(listed))):
+        for place, done in enumerate(self.made.compute(reversed(listed))):
             self.given.append(len(listed) - 1 - place)
             away = "it died" if first + place in self.lost else ""
             yield BatchResult(done.items, None if away else done.value, "tcp://1", "ab12" if place else None, away)

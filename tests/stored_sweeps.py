@@ -62,7 +62,7 @@ def make_sweep(
             )  # fmt: skip
             if keep == "all" or (keep == "wrong" and wrong):
                 picture = np.full((16, 16, 3), step / len(points), np.float32)
-                thumbnails.keep(run.path, step, thumbnails.thumbnail(picture))
+                thumbnails.write_thumbnail(run.path, step, thumbnails.make_thumbnail(picture))
         run.record(*rows)
         if ended:
             right = sum(bool(one.correct) for one in rows)

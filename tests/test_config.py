@@ -30,7 +30,7 @@ from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.stability.result import StabilityConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig
-from advsearch.settings import Config, PythonOnly, Setting, all_finite, parse_assignment, read_yaml, settings
+from advsearch.settings import Config, PythonOnly, Setting, are_all_finite, parse_assignment, read_yaml, settings
 from hostile import HOSTILE, shown
 
 WRONG: dict[str, tuple[Any, str]] = {
@@ -261,7 +261,7 @@ def test_every_command_is_repeated_by_its_yaml(config: Config, tmp_path: Path) -
     assert read_yaml(path)["command"] == config.command
     assert config.command_line(tmp_path) == f"advsearch run {path}" and config.command_line(None) is None
     assert config.command_line("my run") == "advsearch run 'my run/run.yaml'"
-    only_here = config.with_only_here([PythonOnly("scene"), PythonOnly("model", "mine")])
+    only_here = config.with_python_only_parts([PythonOnly("scene"), PythonOnly("model", "mine")])
     assert only_here.command_line(tmp_path) is None and only_here.python_only == ["the scene", "the model mine"]
 
 
@@ -298,7 +298,7 @@ def test_what_is_typed_is_read_as_yaml_has_it(line: str, tmp_path: Path) -> None
     typed: AttackConfig = of_command_line(f"advsearch attack --object mug{models} {words}")
     file = tmp_path / "run.yaml"
     file.write_text(f"object: mug\n{models.replace(' --model ', 'model: ')}\n{name}: {value}\n")
-    assert typed == AttackConfig.from_yaml(file) and typed.plain()[name] == yaml.safe_load(value)
+    assert typed == AttackConfig.from_yaml(file) and typed.to_json()[name] == yaml.safe_load(value)
 
 
 def test_what_a_grid_is_typed_as(tmp_path: Path) -> None:
@@ -361,11 +361,14 @@ def test_no_value_of_any_setting_ends_in_a_traceback(config: type[Config]) -> No
                 assert len(str(error)) < 500 and str(error).isprintable(), (setting.name, shown(value))
                 continue
             given = getattr(made, setting.field)
-            assert all_finite(given if isinstance(given, (list, tuple, dict)) else [given]), (
+            assert are_all_finite(given if isinstance(given, (list, tuple, dict)) else [given]), (
                 setting.name,
                 shown(value),
             )
-            assert made.to_yaml() and made.command_line("x") and made.deciding(), (setting.name, shown(value))
+            assert made.to_yaml() and made.command_line("x") and made.get_deciding_settings(), (
+                setting.name,
+                shown(value),
+            )
 
 
 @pytest.mark.parametrize(
@@ -599,7 +602,7 @@ def test_a_task_has_options_as_a_policy_has(given: Any, config: type[SceneConfig
     (tmp_path / "run.yaml").write_text(made.to_yaml())
     assert config.from_yaml(tmp_path / "run.yaml") == made
     assert config.from_yaml(tmp_path / "run.yaml", {"task.tolerance": 7}).task == {"name": "yaw", "tolerance": 7}
-    assert made.deciding()["task"] == made.task, "a run with other options is not gone on with"
+    assert made.get_deciding_settings()["task"] == made.task, "a run with other options is not gone on with"
     plain = config(object="mug", task="yaw={}", **own)
     assert (plain.task_name, plain.task) == ("yaw", "yaw")
 

@@ -25,37 +25,37 @@ from PIL import Image
 import advsearch
 import advsearch.config
 from advsearch.attacks import (
+    count_planned_renders,
     make_policy,
-    planned_renders,
 )
 from advsearch.attacks.objectives import check_objective
 from advsearch.cli.flags import config_from
 from advsearch.cli.main import _parse
 from advsearch.config import CONFIGS, RenderConfig, SceneConfig
-from advsearch.engine.acceptance import compared, view_of
-from advsearch.engine.loading import as_controls
-from advsearch.engine.naming import check_run_settings, given_to
+from advsearch.engine.acceptance import compare_views, compare_with_traced
+from advsearch.engine.loading import make_controls
+from advsearch.engine.naming import check_run_settings, make_configured_controls
 from advsearch.files import MESHES
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.compare import CompareConfig
 from advsearch.questions.explain import ExplainConfig
-from advsearch.questions.harden.result import ALL, HardenConfig
-from advsearch.questions.recipe.description import planned, read_recipe
-from advsearch.questions.recipe.description import recipe_names as recipes
+from advsearch.questions.harden.result import ALL_OBJECTS, HardenConfig
+from advsearch.questions.recipe.description import list_recipes as recipes
+from advsearch.questions.recipe.description import plan_runs, read_recipe
 from advsearch.questions.recipe.result import RecipeConfig
 from advsearch.questions.replay.result import WAYS, ReplayConfig
 from advsearch.questions.stability.result import StabilityConfig
-from advsearch.questions.stability.scenes import chosen
-from advsearch.questions.sweep.axes import read_axes
+from advsearch.questions.stability.scenes import select_cases
+from advsearch.questions.sweep.axes import parse_axes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig, read_suite
 from advsearch.runs import export
 from advsearch.runs.exporters import EXPORTERS
 from advsearch.scene import library
-from advsearch.scene.importing.scenes import MITSUBA_FILE, split_node
+from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, split_node
 from advsearch.scene.places.place_file import is_place_file, read_place_file
 from advsearch.scene.rig import read_rig
-from advsearch.scene.settings import resolve
+from advsearch.scene.settings import resolve_settings
 from advsearch.settings import Config, parse_assignment, read_yaml
 from advsearch.tasks import make_task
 from samples import attack
@@ -132,7 +132,7 @@ def lines(page: Path) -> list[list[str]]:
 def check_names(config: Config) -> None:
     """Look up every name in a configuration, as its command would; nothing is loaded."""
     if isinstance(config, StabilityConfig):
-        chosen(config.cases, config.groups)
+        select_cases(config.cases, config.groups)
         return
     if isinstance(config, CompareConfig) and not config.object:
         assert config.pictures >= 0
@@ -144,28 +144,28 @@ def check_names(config: Config) -> None:
         assert config.suite
         return
     if isinstance(config, ReplayConfig):
-        assert set(config.chosen) <= set(WAYS)
+        assert set(config.selected_names) <= set(WAYS)
         return
     if isinstance(config, RecipeConfig):
-        assert config.recipe in ("list", "mine.yaml") or planned(read_recipe(config.recipe), config)
+        assert config.recipe in ("list", "mine.yaml") or plan_runs(read_recipe(config.recipe), config)
         return
     assert isinstance(config, SceneConfig)
     check_run_settings(
         config.model_copy(update=dict.fromkeys(("path", "shutter", "rolling"))) if config.command == "sweep" else config
     )
-    given_to(config, config.controls)
-    resolve(config.set_)
-    lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
+    make_configured_controls(config, config.controls)
+    resolve_settings(config.set_)
+    lights = config.environments if isinstance(config, SweepConfig) else (config.environment_name,)
     for name in config.objects:
-        suffixes = (*MESHES, MITSUBA_FILE)
-        assert name in (*library.list_objects(), ALL) or Path(split_node(name)[0]).suffix in suffixes
+        suffixes = (*MESHES, MITSUBA_SUFFIX)
+        assert name in (*library.list_objects(), ALL_OBJECTS) or Path(split_node(name)[0]).suffix in suffixes
         needs_label = not isinstance(config, (RenderConfig, HardenConfig)) and name not in library.list_objects()
         assert config.label is not None or not needs_label, "a file does not bring a label"
     for name in lights:
-        is_file = Path(name).suffix in library.SUFFIXES or is_place_file(name)
+        is_file = Path(name).suffix in library.ENVIRONMENT_SUFFIXES or is_place_file(name)
         assert name in library.list_environments() or is_file
     if isinstance(config, AttackConfig):
-        as_controls(config.over)
+        make_controls(config.over)
         make_policy(config.policy_name, **config.policy_options)
         task = make_task(config.task)
         check_objective(
@@ -177,7 +177,7 @@ def check_names(config: Config) -> None:
         known = script("make_figures").stored_record()["labels"]
         assert config.model != "reference" or set((config.target or known[0]).split(",")) <= set(known)
     if isinstance(config, SweepConfig):
-        read_axes(config.grid, as_controls(config.controls))
+        parse_axes(config.grid, make_controls(config.controls))
 
 
 def check_advsearch(words: list[str], folder: Path) -> None:
@@ -243,7 +243,7 @@ def test_every_yaml_example_is_a_configuration(page: Path, tmp_path: Path) -> No
         if "claims" in read_yaml(path):
             suite = read_suite(path)
             for name in suite.claims:
-                check_names(AttackConfig.of(suite.config_of(name)))
+                check_names(AttackConfig.from_config(suite.make_config(name)))
             continue
         if "cameras" in read_yaml(path):
             assert len(read_rig(str(path))) > 1
@@ -285,7 +285,7 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
     names: dict[str, Any] = {}
     for block in blocks(PAGES[0], "python"):
         exec(compile(block, "README.md", "exec"), names)
-    assert names["result"].search.renders == planned_renders(40)
+    assert names["result"].search.renders == count_planned_renders(40)
 
 
 @pytest.mark.medium
@@ -331,8 +331,10 @@ def test_the_predictor_of_the_page_is_as_good_as_a_render() -> None:
     picture.mean().backward()
     assert u.grad is not None and float(u.grad) > 0.0
     still = u.detach()
-    deviation = compared(lambda view: view_of(renderer, picture.detach(), still, view, 16, lambda *_: 0.0))
-    assert deviation.good, deviation.reason
+    deviation = compare_views(
+        lambda view: compare_with_traced(renderer, picture.detach(), still, view, 16, lambda *_: 0.0)
+    )
+    assert deviation.is_accepted, deviation.reason
 
 
 # ---- the scripts ----------------------------------------------------------------------------------------------------

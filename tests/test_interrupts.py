@@ -106,16 +106,16 @@ def test_nested_blocks_answer_it_together() -> None:
 
 
 def scene_pictures() -> Any:
-    return MitsubaScene.pictures(object.__new__(MitsubaScene), {}, {}, 1)
+    return MitsubaScene.render_images(object.__new__(MitsubaScene), {}, {}, 1)
 
 
 def model_answers() -> Any:
     model = easy()
-    return model.ask(model.prepared(torch.zeros(1, 8, 8, 3)))
+    return model.run_network(model.prepare(torch.zeros(1, 8, 8, 3)))
 
 
 def workers_results() -> Any:
-    return list(SimulatedWorkers(Simulated()).results([range(2)]))
+    return list(SimulatedWorkers(Simulated()).compute([range(2)]))
 
 
 def progress_advances() -> None:

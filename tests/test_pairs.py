@@ -17,15 +17,15 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.attacks import Query
 from advsearch.controls import CONTROLS, compose, make_control, make_space
-from advsearch.engine.judging import domain_of
-from advsearch.engine.loading import framed, make_renderer
+from advsearch.engine.judging import make_domain
+from advsearch.engine.loading import fit_camera, make_renderer
 from advsearch.engine.problem import Problem
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.sweep.axes import Points, on_grid, read_axes
+from advsearch.questions.sweep.axes import Points, add_grid_axes, parse_axes
 from advsearch.runs.results import plain
-from advsearch.scene.color import to_8_bit
-from advsearch.scene.description import describe
+from advsearch.scene.color import round_to_8_bit
+from advsearch.scene.description import load_description
 from advsearch.tasks import Classification
 
 SIZE = 16
@@ -61,7 +61,7 @@ FORMS: dict[str, dict[str, Any]] = {
     "corruption": {"which": ["fog", "jpeg", "gaussian_noise"], "severity": [0, 5]},
     "mitsuba": {"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]},
 }
-FORMS |= {kind: {} for kind in CONTROLS.own if kind not in FORMS}  # another one varies as it declares itself
+FORMS |= {kind: {} for kind in CONTROLS.built_ins if kind not in FORMS}  # another one varies as it declares itself
 EXCLUSIVE = {frozenset(("sky", "environment")), frozenset(("path", "camera")), frozenset(("geometry", "body"))}
 EXCLUSIVE |= {frozenset(("contents", "body")), frozenset(("material", "body"))}
 """Pairs that set the same input and are refused; nobody is a vessel, and no named material covers a person."""
@@ -111,9 +111,11 @@ def model() -> advsearch.Model:
 
 @pytest.mark.medium
 def test_every_control_is_here_and_varies() -> None:
-    assert set(FORMS) == set(CONTROLS.own), "FORMS of tests/test_pairs.py names a control that there is not"
+    assert set(FORMS) == set(CONTROLS.built_ins), "FORMS of tests/test_pairs.py names a control that there is not"
     for kind, form in FORMS.items():
-        varied = compose([make_control(kind, form)], describe(suited([kind]), things=beside([kind]))).start.numel()
+        varied = compose(
+            [make_control(kind, form)], load_description(suited([kind]), things=beside([kind]))
+        ).start.numel()
         assert varied, f"{kind} has no range: give a parameter `search=(low, high)`, or {kind} a form in FORMS"
 
 
@@ -137,22 +139,22 @@ def test_a_row_of_a_sweep_is_true_of_its_own_picture(pair: tuple[str, ...], mode
         resolution=SIZE,
         label="mug",  # of a person too: the model knows none
     )
-    description = framed(scene.description, SIZE)
+    description = fit_camera(scene.description, SIZE)
     drawn = tuple(make_control(kind, given) for kind, given in controls.items())
-    axes = read_axes(grid, drawn)
+    axes = parse_axes(grid, drawn)
     rows = {row.step: row for row in found.rows()}
     worst = found.summary.worst
     assert worst is not None and plain(worst.values) == rows[worst.configuration].values
     for row in rows.values():
         assert row.seed is not None
-        space = make_space(on_grid(drawn, axes, description), description)
-        points = Points(space, domain_of(space.controls), axes, samples, "sobol", 3)
-        u = points.configurations(row.step, 1)[0]
+        space = make_space(add_grid_axes(drawn, axes, description), description)
+        points = Points(space, make_domain(space.controls), axes, samples, "sobol", 3)
+        u = points.make_configurations(row.step, 1)[0]
         said = {name: value for name, value in row.values.items() if "." in name}
-        assert_close(said, points.values(u[None], row.step)[0], 1e-6)  # threads add up a mean in another order
+        assert_close(said, points.describe_images(u[None], row.step)[0], 1e-6)  # threads add up a mean in another order
         assert_close(said, space.describe(u))
         renderer = make_renderer(description, space, SIZE, "none", 3)
-        picture = to_8_bit(renderer(u, seed=row.seed, spp=1)[None])
+        picture = round_to_8_bit(renderer(u, seed=row.seed, spp=1)[None])
         ((seen,),) = Classification().predictions(model(picture))
         assert row.label_index == seen.index and row.probability == pytest.approx(seen.probability, rel=1e-4)
         assert_true_of_fixed_values(scene, drawn, said, picture[0], row.seed)
@@ -178,15 +180,15 @@ def assert_true_of_fixed_values(
     }
     for name, value in said.items():
         kind, _, parameter = name.partition(".")
-        declared = {one.name for one in CONTROLS[kind].declared([parameter])}
+        declared = {one.name for one in CONTROLS[kind].declare_parameters([parameter])}
         if parameter in declared:
             named.setdefault(kind, {})[parameter] = value["value"]
         elif kind in PICTURES or ("." in parameter and parameter.partition(".")[0] in declared):
             return  # one number of many cannot be fixed alone, and neither can a picture
-    description = framed(scene.description, SIZE)
+    description = fit_camera(scene.description, SIZE)
     space = compose([make_control(kind, given) for kind, given in named.items()], description)
     renderer = make_renderer(description, space, SIZE, "none", 3)
-    again = to_8_bit(renderer(space.start, seed=seed, spp=1))
+    again = round_to_8_bit(renderer(space.start, seed=seed, spp=1))
     if "sky" not in named:  # the exposure is metered at the start, which a fixed sky moves
         assert float((again - picture).abs().mean()) < CLOSE
     described = space.describe(space.start)
@@ -197,7 +199,7 @@ def assert_true_of_fixed_values(
 
 def searched_picture(problem: Problem, u: Tensor) -> Tensor:
     """The picture (H, W, 3) that a search's evaluation of a configuration looks at."""
-    picture = problem.evaluate(Query(u, 5, phase="search", keep=True)).picture
+    picture = problem.evaluate(Query(u, 5, phase="search", with_image=True)).picture
     assert picture is not None
     return picture
 
@@ -217,12 +219,12 @@ def test_a_row_of_an_attack_is_true_of_its_own_picture(pair: tuple[str, ...]) ->
     )  # fmt: skip
     problem, _ = problem_from_config(config)
     draws = [problem.domain.sample(torch.Generator().manual_seed(seed))[0] for seed in (1, 2)]
-    rows = [(problem.evaluate(Query(u, 7)).said, problem.describe(u)) for u in draws]
+    rows = [(problem.evaluate(Query(u, 7)).required_judgement, problem.describe(u)) for u in draws]
     seen = [searched_picture(problem, u) for u in draws]
     for u, (trial, values), picture in zip(draws, rows, seen, strict=True):
         alone, _ = problem_from_config(config)
         assert_close(values, alone.describe(u))
-        again = alone.evaluate(Query(u, 7)).said
+        again = alone.evaluate(Query(u, 7)).required_judgement
         assert trial.prediction.index == again.prediction.index
         assert (trial.margin, trial.prediction.probability) == pytest.approx(
             (again.margin, again.prediction.probability), rel=1e-3, abs=1e-3
@@ -240,9 +242,9 @@ def test_an_occluder_is_described_under_the_conditions_of_its_own_draw() -> None
     u = torch.tensor([0.5])
     seen = set()
     for seed in (3, 4):
-        said = {**problem.describe(u, seed), **problem.conditions_of(u, seed)}
+        said = {**problem.describe(u, seed), **problem.describe_conditions(u, seed)}
         camera = make_control("camera", {"sizes": said["camera.sizes"]["value"]})
-        alone = describe("mug")
+        alone = load_description("mug")
         occlusion = make_control("occlusion", {"coverage": [0.2, 0.4]})
         space = make_space([occlusion, camera], alone)
         fresh = space.describe(torch.cat([u, space.start[1:]]))
@@ -253,9 +255,9 @@ def test_an_occluder_is_described_under_the_conditions_of_its_own_draw() -> None
 
 def test_the_picture_of_a_material_that_is_kept_has_the_texture_that_lies_under_it() -> None:
     controls = [make_control("texture", {"resolution": 8, "epsilon": 0.4}), make_control("material", {"red": [0.3, 1]})]
-    space = make_space(controls, describe("mug"))
+    space = make_space(controls, load_description("mug"))
     painted = space.start.clone()
     painted[:-1] = (painted[:-1] + 0.4).clamp(0.0, 1.0)
-    kept = space.artifacts(painted)
+    kept = space.get_artifact_images(painted)
     assert torch.allclose(kept["material"], kept["texture"], atol=1e-4)
-    assert not torch.allclose(kept["material"], space.artifacts(space.start)["material"], atol=0.05)
+    assert not torch.allclose(kept["material"], space.get_artifact_images(space.start)["material"], atol=0.05)

@@ -16,7 +16,7 @@ from advsearch.attacks.trials import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
 from advsearch.cli.output import shown_text as check_text
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings
+from advsearch.engine.record import RunState
 from advsearch.experiment import run_experiment as answered
 from advsearch.progress import Stages
 from advsearch.questions.attack.settings import AttackConfig
@@ -74,7 +74,7 @@ class Recorded:
         return [one for one in self.stages if part in one.name]
 
 
-def attacked(config: AttackConfig, problem: Any = None) -> tuple[Recorded, Findings]:
+def attacked(config: AttackConfig, problem: Any = None) -> tuple[Recorded, RunState]:
     """An attack without the renderer, in memory."""
     progress = Recorded()
     problem = problem or StandInProblem()
@@ -110,7 +110,7 @@ def test_the_smallest_change_counts_what_it_says() -> None:
     blocks = tuple(block for block in problem.domain.blocks if block.epsilon is not None)
     problem.domain = type(problem.domain)(torch.full((4,), 0.5), blocks)
     progress, findings = attacked(configuration(smallest=True), problem)
-    assert findings.smallest is not None and findings.smallest.searches > 1
+    assert findings.bracket is not None and findings.bracket.searches > 1
     progress.check()
     assert progress.named("search 1 of at most 12")[0].total == 33
     assert progress.named("trying smaller changes")[0].done > 6
@@ -123,7 +123,7 @@ def test_the_samples_of_the_smallest_change_are_those_of_the_clean_scene() -> No
     problem.domain = type(problem.domain)(torch.full((4,), 0.5), blocks)
     config = configuration(smallest=True).model_copy(update={"verify_spp": None})
     _, findings = attacked(config, problem)
-    assert findings.smallest is not None and findings.verification is not None and findings.sample_count is not None
+    assert findings.bracket is not None and findings.verification is not None and findings.sample_count is not None
     assert {row.name for row in findings.sample_count.table} == {"clean"} and findings.spp == 16
 
 
@@ -145,8 +145,8 @@ def test_no_smallest_change_is_sought_where_no_change_is_needed() -> None:
     problem.domain = type(problem.domain)(torch.full((4,), 0.5), blocks)
     progress, findings = attacked(configuration(smallest=True), problem)
     assert any(trial.right for trial in findings.first_look), "the first look was not enough to tell"
-    assert sum(trial.right for trial in findings.clean) < len(findings.clean) / 2
-    assert findings.search is None and findings.smallest is None and findings.verification is None
+    assert sum(trial.right for trial in findings.clean_trials) < len(findings.clean_trials) / 2
+    assert findings.search is None and findings.bracket is None and findings.verification is None
     assert not progress.named("search 1 of")
 
 
@@ -172,7 +172,7 @@ def test_the_pictures_of_growing_a_box_have_a_bound(most: int, monkeypatch: pyte
         return float(u.mean()) + 0.05 * float(torch.randn((), generator=generator)) < 0.6
 
     monkeypatch.setattr(boxes, "MAX_PROBED", most)
-    boxes.grow(same, torch.full((3,), 0.5), seed=0, samples=20, on_check=lambda: checked.append(pictures))
+    boxes.grow_box(same, torch.full((3,), 0.5), seed=0, samples=20, on_check=lambda: checked.append(pictures))
     assert 100 < checked[0] <= 3 * most and 1 <= len(checked) <= boxes.ATTEMPTS
 
 
@@ -225,7 +225,7 @@ def test_a_resumed_run_takes_its_probes_from_the_store(tmp_path: Path, monkeypat
 
     def evaluate(self: Any, query: Query) -> Evaluation:
         if query.phase is None:
-            rendered.append((query.spp, query.drawn))
+            rendered.append((query.spp, query.draws_conditions))
             if len(rendered) == stop:
                 raise KeyboardInterrupt
         return once(self, query)

@@ -25,7 +25,7 @@ import torch
 from advsearch.attacks import (
     POLICIES,
     candidates,
-    planned_renders,
+    count_planned_renders,
     trials,
     verification,
 )
@@ -41,7 +41,7 @@ from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.questions.attack import stages
 from advsearch.questions.attack.settings import (
-    FEWEST_TRIALS,
+    MIN_TRIALS,
     TRIALS,
     TRIALS_OVER,
     AttackConfig,
@@ -63,7 +63,7 @@ from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import settings
 from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
-from advsearch.statistics.sequential import draws_needed
+from advsearch.statistics.sequential import count_needed_samples
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -248,7 +248,8 @@ def names() -> Iterator[str]:
     bundled = [*SETTINGS, *library.list_objects(), *library.list_environments()]
     yield from absent("scenes.md", [f"| `{name}` |" for name in bundled])
     yield from absent(
-        "scenes.md", [f"`{ending}`" for ending in (*MESHES, *library.SUFFIXES)]
+        "scenes.md",
+        [f"`{ending}`" for ending in (*MESHES, *library.ENVIRONMENT_SUFFIXES)],
     )
     options = set(inspect.signature(loading.load_model).parameters) - {
         "spec",
@@ -375,7 +376,7 @@ def made() -> Iterator[str]:
 def _looks() -> tuple[int, int, int]:
     """Trials that all have to succeed, and what is needed of how many else."""
     first, last = verification.TRIAL_LOOKS
-    return WORST_CASE.needed(first), WORST_CASE.needed(last), last
+    return WORST_CASE.count_needed(first), WORST_CASE.count_needed(last), last
 
 
 def _exceptions(samples: int) -> float:
@@ -391,12 +392,12 @@ def _exceptions(samples: int) -> float:
 
 def _draws(mean: float, value: float = 1.0) -> int:
     """Pictures that decide a claim where all predictions are alike."""
-    return draws_needed(mean, confidence=CONFIDENCE, value=value)
+    return count_needed_samples(mean, confidence=CONFIDENCE, value=value)
 
 
 MADE_BY_HAND = [
-    ("design.md", f"**First look**: {stages.FIRST_LOOK} renders of the clean scene"),
-    ("design.md", f"That makes `steps` + {planned_renders(0)} renders"),
+    ("design.md", f"**First look**: {stages.N_FIRST_LOOKS} renders of the clean scene"),
+    ("design.md", f"That makes `steps` + {count_planned_renders(0)} renders"),
     (
         "design.md",
         f"at {', '.join(map(str, trials.LADDER[:-1]))} and "
@@ -405,7 +406,7 @@ MADE_BY_HAND = [
     (
         "design.md",
         "Looks are after {}, {} and {} renders".format(
-            *trials.looks_of(verification.TRIAL_LOOKS[0])
+            *trials.list_look_sizes(verification.TRIAL_LOOKS[0])
         ),
     ),
     ("design.md", f"{TRIALS_OVER} with `--over`, {TRIALS} with `--smallest`"),
@@ -423,7 +424,7 @@ MADE_BY_HAND = [
     ("design.md", f"at most {mitsuba_scene.MAX_DEPTH} segments"),
     (
         "questions.md",
-        {8: "Eight renders of the best configurations"}[planned_renders(0)],
+        {8: "Eight renders of the best configurations"}[count_planned_renders(0)],
     ),
     ("questions.md", f"**Verified** by {verification.TRIAL_LOOKS[0]} fresh renders"),
     (
@@ -433,7 +434,7 @@ MADE_BY_HAND = [
     ("questions.md", {12: "or twelve searches are done"}[candidates.ROUNDS]),
     (
         "questions.md",
-        f"Each step needs {FEWEST_TRIALS} trials without a failure, or {TRIALS} trials "
+        f"Each step needs {MIN_TRIALS} trials without a failure, or {TRIALS} trials "
         "after one failure",
     ),
     ("questions.md", f"**Verified** on up to {TRIALS_OVER} conditions"),
@@ -461,7 +462,7 @@ MADE_BY_HAND = [
     (
         "testing.md",
         "in all {} trials ({} for one".format(
-            *(tested.TRIALS[over] for over in (False, True))
+            *(tested.N_TRIALS[over] for over in (False, True))
         ),
     ),
     (
@@ -470,18 +471,18 @@ MADE_BY_HAND = [
     ),
     (
         "design.md",
-        f"are rendered under {trials.CONDITIONS} conditions at 4, 16 and 64 samples",
+        f"are rendered under {trials.N_CONDITIONS} conditions at 4, 16 and 64 samples",
     ),
     (
         "design.md",
-        f"carry at most {100 * trials.MOVED:.0f} % of the conditions over zero",
+        f"carry at most {100 * trials.MAX_MOVED_FRACTION:.0f} % of the conditions over zero",
     ),
     ("runs.md", {1.0: "may lose the rows of the last second"}[store.SYNC_INTERVAL]),
     ("runs.md", f"more than {100 * store.SYNC_SHARE:.0f} % of the time"),
     ("scenes.md", f"reaches to {100 * FRAME_FILL:.0f} % of the way"),
-    ("scenes.md", f"gets the linear value {formation.METERED_WHITE}"),
+    ("scenes.md", f"gets the linear value {formation.CARD_DISPLAY_VALUE}"),
     ("scenes.md", f"averaged down to at most {TEXTURE_LIMIT} texels"),
-    ("scenes.md", "Maps larger than {1} x {0} are".format(*library.LARGEST)),
+    ("scenes.md", "Maps larger than {1} x {0} are".format(*library.MAX_MAP_SIZE)),
     ("controls/texture.md", f"Default {DEFAULT_EPSILON}"),
     ("controls/texture.md", "at least {} and at most {}".format(*texture.RESOLUTIONS)),
     ("policies/pgd.md", f"the first after {100 * pgd.FIRST_WINDOW:.0f} % of the steps"),

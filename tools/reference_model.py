@@ -172,7 +172,7 @@ def train(cache: Path, counts: dict[str, int], epochs: int, seed: int) -> None:
         seed=seed,
         progress=say,
     )
-    folder = reference.data_folder()
+    folder = reference.get_data_folder()
     folder.mkdir(exist_ok=True)
     training.save(folder, state, labels())
     logits = calibration.predict(reference.load(folder), held)
@@ -198,7 +198,7 @@ def evaluate(cache: Path, count: int, seed: int) -> None:
 
     from advsearch.models import reference
 
-    folder = reference.data_folder()
+    folder = reference.get_data_folder()
     record = json.loads((folder / reference.RECORD).read_text(encoding="utf-8"))
     images, truth = pictures(cache, "heldout", count, seed)
     report = calibration.evaluate(reference.load(folder), images, truth)
@@ -226,7 +226,7 @@ def default_views(spp: int = 64) -> dict[str, float]:
     from advsearch.controls import Space
     from advsearch.models import reference
     from advsearch.questions.harden.objects import HOUSEHOLD
-    from advsearch.scene.description import describe
+    from advsearch.scene.description import load_description
     from advsearch.scene.formation import ImageFormation
     from advsearch.scene.mitsuba_backend.scene import MitsubaScene
     from advsearch.scene.renderer import Renderer
@@ -234,7 +234,7 @@ def default_views(spp: int = 64) -> dict[str, float]:
     model = reference.load()
     found = {}
     for name in sorted(HOUSEHOLD):
-        description = describe(name)
+        description = load_description(name)
         formation = ImageFormation(resolution=SIZE, gain=description.gain)
         renderer = Renderer(MitsubaScene(description, SIZE), Space(()), formation)
         with torch.no_grad():

@@ -17,16 +17,21 @@ import numpy as np
 import torch
 
 from advsearch.controls import Space
-from advsearch.questions.harden.changed_light import varied
+from advsearch.questions.harden.changed_light import vary_environment
 from advsearch.questions.harden.objects import HOUSEHOLD
 from advsearch.scene import library
-from advsearch.scene.assets import Floats, ObjectAsset
+from advsearch.scene.assets import Float32Array, ObjectAsset
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import EVERYTHING, ImageFormation
-from advsearch.scene.geometry import DEFAULT_VIEW, FRAME_FILL, camera_axes, middle
+from advsearch.scene.formation import ALL_OMISSIONS, ImageFormation
+from advsearch.scene.geometry import (
+    DEFAULT_VIEW,
+    FRAME_FILL,
+    compute_camera_axes,
+    compute_center,
+)
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.settings import resolve
+from advsearch.scene.settings import resolve_settings
 
 CLASSES = tuple(sorted(HOUSEHOLD))
 """Object names in the order of the class indices."""
@@ -64,7 +69,7 @@ def picture(split: str, index: int, seed: int = 0) -> Picture:
     formation = ImageFormation(
         denoiser=denoiser, resolution=SIZE, gain=description.gain
     )
-    scene = MitsubaScene(description, SIZE, leave_out=EVERYTHING - {"tracing"})
+    scene = MitsubaScene(description, SIZE, leave_out=ALL_OMISSIONS - {"tracing"})
     renderer = Renderer(scene, Space(()), formation, root_seed=seed)
     with torch.no_grad():
         display = renderer(
@@ -81,7 +86,7 @@ def random_scene(
     """
     asset = _recoloured(HOUSEHOLD[name].generate(rng), rng)
     names = library.list_environments(environments)
-    environment = varied(
+    environment = vary_environment(
         library.load_environment(names[int(rng.integers(len(names)))]), rng
     )
     ground = rng.uniform(0.1, 0.9) + rng.normal(0.0, 0.08, 3)
@@ -107,12 +112,14 @@ def random_scene(
         ),
     }
     scene = SceneDescription(
-        asset, environment, resolve({key: float(value) for key, value in given.items()})
+        asset,
+        environment,
+        resolve_settings({key: float(value) for key, value in given.items()}),
     )
     # as far away as the object just fits into a square picture
-    offsets = scene.object.mesh.vertices.astype(np.float64) - middle(scene)
+    offsets = scene.object.mesh.vertices.astype(np.float64) - compute_center(scene)
     left, up, outwards = (
-        camera_axes(*(scene.number(name) for name in DEFAULT_VIEW)) @ offsets.T
+        compute_camera_axes(*(scene.number(name) for name in DEFAULT_VIEW)) @ offsets.T
     )
     tangent = FRAME_FILL * math.tan(math.radians(scene.number("camera.fov")) / 2.0)
     distance = (outwards + np.maximum(np.abs(left), np.abs(up)) / tangent).max()
@@ -131,7 +138,7 @@ def _recoloured(asset: ObjectAsset, rng: np.random.Generator) -> ObjectAsset:
     return replace(asset, base_color=np.clip(color, 0.0, 1.0).astype(np.float32))
 
 
-def _blotches(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
+def _blotches(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
     """Smooth colour noise with values around -1 to 1, from a coarse grid."""
     cells = int(rng.integers(3, 24))
     coarse = torch.from_numpy(

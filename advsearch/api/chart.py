@@ -22,39 +22,43 @@ from PIL import Image, ImageCms
 from scipy import ndimage
 from torch import Tensor
 
-from advsearch.calls import helped
+from advsearch.calls import with_checked_arguments
 from advsearch.errors import InputError
 from advsearch.pictures import upright
 from advsearch.report.sheets import MARGIN, blank
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 
 Floats = npt.NDArray[np.float64]
-COLOURS = np.array(list(itertools.product((0.1, 0.3, 0.5, 0.7, 0.9), repeat=3)))
+CHART_COLORS = np.array(list(itertools.product((0.1, 0.3, 0.5, 0.7, 0.9), repeat=3)))
 """(125, 3) sRGB: the printable colours of `--printable`."""
 COLUMNS = 9
 PITCH = 15.0
-PATCH = 12.0
-CORNER = 9.0
+PATCH_SIZE = 12.0
+CORNER_SIZE = 9.0
 """Patches in a row; their pitch, their size and that of a black square in millimetres."""
-ROWS = -(-len(COLOURS) // COLUMNS)
+ROWS = -(-len(CHART_COLORS) // COLUMNS)
 # Width and height of all patches with the paper around them, in millimetres.
-SIZE = (COLUMNS * PITCH, ROWS * PITCH)
-CORNERS = np.array(
-    [(x, y) for y in (-CORNER, SIZE[1] + CORNER) for x in (-CORNER, SIZE[0] + CORNER)]
+CHART_SIZE = (COLUMNS * PITCH, ROWS * PITCH)
+CORNER_CENTERS = np.array(
+    [
+        (x, y)
+        for y in (-CORNER_SIZE, CHART_SIZE[1] + CORNER_SIZE)
+        for x in (-CORNER_SIZE, CHART_SIZE[0] + CORNER_SIZE)
+    ]
 )
 """(4, 2) centers of the black squares, from the upper left corner of the patches, in
 reading order.
 """
-LARGEST_SIDE = 8192
+MAX_IMAGE_SIZE = 8192
 # (125, 2) centers of the patches.
-MIDDLES = (
-    np.stack(np.divmod(np.arange(len(COLOURS)), COLUMNS)[::-1], axis=1) + 0.5
+PATCH_CENTERS = (
+    np.stack(np.divmod(np.arange(len(CHART_COLORS)), COLUMNS)[::-1], axis=1) + 0.5
 ) * PITCH
 # Maximum brightness of a black square, relative to paper.
-DARK = 0.35
+MAX_DARK_BRIGHTNESS = 0.35
 
 
-def chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
+def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
     """Draw the chart on the center of a page, for `write_sheets`.
 
     Args:
@@ -63,8 +67,8 @@ def chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
         convert: a color transform of PIL; None for none.
     """
     figure, axes = blank(paper)
-    left = (paper[0] - SIZE[0]) / 2.0
-    top = MARGIN + 2.0 * CORNER
+    left = (paper[0] - CHART_SIZE[0]) / 2.0
+    top = MARGIN + 2.0 * CORNER_SIZE
 
     def draw_square(x: float, y: float, size: float, color: object) -> None:
         corner = (left + x - size / 2, top + y - size / 2)
@@ -74,13 +78,13 @@ def chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
             )
         )
 
-    colors = Image.fromarray(np.round(255.0 * COLOURS[None]).astype(np.uint8))
+    colors = Image.fromarray(np.round(255.0 * CHART_COLORS[None]).astype(np.uint8))
     printed = colors if convert is None else ImageCms.applyTransform(colors, convert)
     levels = np.asarray(printed)[0] / 255.0
-    for (x, y), color in zip(MIDDLES, levels, strict=True):
-        draw_square(x, y, PATCH, tuple(color))
-    for x, y in CORNERS:
-        draw_square(x, y, CORNER, "black")
+    for (x, y), color in zip(PATCH_CENTERS, levels, strict=True):
+        draw_square(x, y, PATCH_SIZE, tuple(color))
+    for x, y in CORNER_CENTERS:
+        draw_square(x, y, CORNER_SIZE, "black")
     axes.text(
         paper[0] - MARGIN,
         paper[1] - MARGIN,
@@ -92,7 +96,7 @@ def chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
     return figure
 
 
-@helped
+@with_checked_arguments
 def measured_palette(photograph: str | Path) -> Tensor:
     """Measure the colors that a printer makes of the 125 of `printable`.
 
@@ -109,14 +113,14 @@ def measured_palette(photograph: str | Path) -> Tensor:
         FileFormatError: the file is no image, or too large.
         InputError: it shows no such chart.
     """
-    light = srgb_to_linear(upright(Path(photograph), LARGEST_SIDE)).astype(np.float64)
-    homography = _homography(CORNERS, _find_corners(light, photograph))
-    patch_offsets = _grid(np.linspace(-0.25, 0.25, 7) * PATCH)
-    paper_offsets = _grid(np.linspace(-0.3, 0.3, 3) * (PITCH - PATCH))
+    light = srgb_to_linear(upright(Path(photograph), MAX_IMAGE_SIZE)).astype(np.float64)
+    homography = _compute_homography(CORNER_CENTERS, _find_corners(light, photograph))
+    patch_offsets = _make_pairs(np.linspace(-0.25, 0.25, 7) * PATCH_SIZE)
+    paper_offsets = _make_pairs(np.linspace(-0.3, 0.3, 3) * (PITCH - PATCH_SIZE))
     # Bare paper at the four corners between a patch and its neighbours.
-    crossings = _grid((-PITCH / 2.0, PITCH / 2.0))
+    crossings = _make_pairs((-PITCH / 2.0, PITCH / 2.0))
     colors = []
-    for center in MIDDLES:
+    for center in PATCH_CENTERS:
         patch_light = np.median(
             _sample(light, homography, center + patch_offsets), axis=0
         )
@@ -130,7 +134,7 @@ def measured_palette(photograph: str | Path) -> Tensor:
     return torch.from_numpy(linear_to_srgb(np.array(colors, np.float32)))
 
 
-def _grid(values: Iterable[float]) -> Floats:
+def _make_pairs(values: Iterable[float]) -> Floats:
     """Return all pairs (N, 2) of values."""
     return np.array(list(itertools.product(values, repeat=2)))
 
@@ -169,7 +173,7 @@ def _find_corners(light: Floats, photograph: str | Path) -> Floats:
 def _find_dark_squares(light: Floats) -> list[tuple[float, float, int]]:
     """Return center x, center y and area in pixels of all dark, filled squares."""
     brightness = light.mean(axis=2)
-    is_dark = brightness < DARK**2.2 * np.percentile(brightness, 95)
+    is_dark = brightness < MAX_DARK_BRIGHTNESS**2.2 * np.percentile(brightness, 95)
     labels, count = ndimage.label(is_dark)
     squares = []
     boxes = ndimage.find_objects(labels) if count else []
@@ -184,7 +188,7 @@ def _find_dark_squares(light: Floats) -> list[tuple[float, float, int]]:
     return squares
 
 
-def _homography(points: Floats, pixels: Floats) -> Floats:
+def _compute_homography(points: Floats, pixels: Floats) -> Floats:
     """Compute the (3, 3) homography that maps four points (4, 2) to pixels (4, 2)."""
     rows = []
     for (x, y), (u, v) in zip(points, pixels, strict=True):

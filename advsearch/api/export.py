@@ -18,24 +18,27 @@ from scipy import ndimage
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.controls.base import Control, file_name
-from advsearch.controls.support.images import enlarged
+from advsearch.controls.base import Control, to_file_name
+from advsearch.controls.support.images import enlarge
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.loading import Scene, as_controls, load_scene
+from advsearch.engine.loading import Scene, load_scene, make_controls
 from advsearch.engine.problem import Problem
-from advsearch.engine.verifier import kept_configuration
+from advsearch.engine.verifier import read_stored_configuration
 from advsearch.errors import InputError
-from advsearch.questions.attack.carry_out import judged_alone, problem_from_config
+from advsearch.questions.attack.carry_out import (
+    problem_from_config,
+    with_evaluation_only,
+)
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import AttackSummary, attack_of
+from advsearch.questions.attack.summary import AttackSummary, load_attack_summary
 from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
 from advsearch.runs.files import read_png, to_8bit
-from advsearch.scene.assembly import ON_PICTURE, posed
-from advsearch.scene.assets import Floats, Ints, Mesh, Shape
-from advsearch.scene.description import NO_MAP, OBJECT
+from advsearch.scene.assembly import IMAGE_INPUTS, pose_mesh
+from advsearch.scene.assets import Float32Array, IntArray, Mesh, Shape
+from advsearch.scene.description import NO_ENVIRONMENT, OBJECT
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import doubled_areas, rasterised
+from advsearch.scene.raster import compute_doubled_areas, rasterize_charts
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +65,14 @@ class AdversarialRun:
             FileFormatError: it has not finished, or is of another command.
         """
         folder = find_run(run)
-        summary = attack_of(folder)
+        summary = load_attack_summary(folder)
         if summary.adversarial is None:
             raise InputError(
                 f"{folder}: ended with {summary.ending!r}, so that there is no "
                 "adversarial configuration to export"
             )
         problem, _ = problem_from_config(
-            judged_alone(AttackConfig.from_yaml(folder / CONFIG))
+            with_evaluation_only(AttackConfig.from_yaml(folder / CONFIG))
         )
         # where conditions vary, those of the picture that the run keeps
         trial = summary.adversarial.trial
@@ -77,13 +80,15 @@ class AdversarialRun:
             None if trial is None else seeds.stream(problem.seed, "verification", trial)
         )
         return cls(
-            folder, problem, problem.whole(kept_configuration(folder, problem), draw)
+            folder,
+            problem,
+            problem.add_conditions(read_stored_configuration(folder, problem), draw),
         )
 
     def split_inputs(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return the inputs of the scene inside Mitsuba, and those applied to its image."""
         inputs = self.inputs
-        on_image = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
+        on_image = {name: inputs.pop(name) for name in IMAGE_INPUTS if name in inputs}
         return inputs, on_image
 
     def posed_object(self) -> tuple[MeshPart, Shape]:
@@ -93,27 +98,29 @@ class AdversarialRun:
         description = self.problem.space.scene
         assert description is not None
         part = description.meshes[OBJECT]
-        return part, posed(part, self.inputs)
+        return part, pose_mesh(part, self.inputs)
 
     def render(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
         """Render the scene with some inputs as the run does: an image (H, W, 3), sRGB in [0, 1]."""
         renderer = self.problem.renderer
         traced = {
-            name: value for name, value in inputs.items() if name not in ON_PICTURE
+            name: value for name, value in inputs.items() if name not in IMAGE_INPUTS
         }
         with torch.no_grad():
-            rendered = renderer.rendered(traced, seed, spp, "backdrop.color" in inputs)
-            return renderer.finished(rendered, inputs, self.u)
+            rendered = renderer.render_radiance(
+                traced, seed, spp, "backdrop.color" in inputs
+            )
+            return renderer.finish_image(rendered, inputs, self.u)
 
     @property
-    def on_picture(self) -> list[str]:
+    def image_controls(self) -> list[str]:
         """The names of the controls that change the rendered image."""
         grey = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
-        slices = self.problem.space.slices(self.u)
+        slices = self.problem.space.split_by_control(self.u)
         return [
             control.name
             for control, part in slices
-            if not torch.equal(control.picture(part, grey), grey)
+            if not torch.equal(control.apply_to_image(part, grey), grey)
         ]
 
     @property
@@ -125,30 +132,32 @@ class AdversarialRun:
 
 
 BLEED = 3.0  # color beyond the line to cut, in millimetres
-FINEST = 0.2
+MAX_PIXEL_SIZE = 0.2
 """Maximum size of a printed pixel in millimetres: larger texels are subdivided, with the
 renderer's interpolation.
 """
 # Maximum subdivisions of a texel per axis; odd, so that the center has its own color.
-MOST_PARTS = 9
-LONGEST = 100_000.0  # maximum size of a printed object in millimetres
+MAX_SUBDIVISIONS = 9
+MAX_OBJECT_SIZE = 100_000.0  # maximum size of a printed object in millimetres
 
 
-def real_size(run: str | Path) -> float | None:
+def get_real_size(run: str | Path) -> float | None:
     """Return the size of the object of a run of `attack`, its longest side in millimetres; None
     if it is unknown.
     """
     folder = find_run(run)
-    attack_of(folder)  # refuses others
-    metres = _alone(AttackConfig.from_yaml(folder / CONFIG)).description.object.metres
+    load_attack_summary(folder)  # refuses others
+    metres = _load_object_scene(
+        AttackConfig.from_yaml(folder / CONFIG)
+    ).description.object.metres
     return None if metres is None else metres * 1000.0
 
 
-def _alone(config: AttackConfig) -> Scene:
+def _load_object_scene(config: AttackConfig) -> Scene:
     """Load the scene of an attack with the object alone, without an environment."""
     return load_scene(
         config.object,
-        NO_MAP,
+        NO_ENVIRONMENT,
         up=config.up,
         facing=config.facing,
         size=config.size,
@@ -156,7 +165,7 @@ def _alone(config: AttackConfig) -> Scene:
     )
 
 
-def printable(run: str | Path, size: float) -> list[Piece]:
+def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
     """Return the printable pieces of the adversarial scene of a run of `attack`.
 
     A patch is one piece. A texture has a piece for each connected part of the unwrapped
@@ -171,34 +180,34 @@ def printable(run: str | Path, size: float) -> list[Piece]:
         InputError: nothing can be printed, or the size is out of range.
         FileFormatError: the run is of another kind, has not finished, or lacks files.
     """
-    if not 1.0 <= size <= LONGEST:
+    if not 1.0 <= size <= MAX_OBJECT_SIZE:
         raise InputError(
             "size: expected the object's longest side in millimetres, 1 "
-            f"to {LONGEST:.0f}, got {size}"
+            f"to {MAX_OBJECT_SIZE:.0f}, got {size}"
         )
     folder = find_run(run)
-    summary = attack_of(folder)
+    summary = load_attack_summary(folder)
     config = AttackConfig.from_yaml(folder / CONFIG)
-    scene = _alone(config)
+    scene = _load_object_scene(config)
     pieces = list[Piece]()
-    for control in as_controls(config.controls):
-        texture_file = folder / ARTIFACTS / f"{file_name(control.name)}.png"
+    for control in make_controls(config.controls):
+        texture_file = folder / ARTIFACTS / f"{to_file_name(control.name)}.png"
         if control.kind == "patch":
             pixels = read_png(folder / ARTIFACTS / f"{control.name}-pixels.png")
-            patch_size = size * _relative_patch_size(control, config, summary)
+            patch_size = size * _get_relative_patch_size(control, config, summary)
             pixel_size = patch_size / len(pixels)
             name = f"{control.name}, {patch_size:.1f} mm a side"
-            pieces.append(_piece(name, pixels, (pixel_size, pixel_size), None))
+            pieces.append(_make_piece(name, pixels, (pixel_size, pixel_size), None))
         elif isinstance(control, TextureControl) and texture_file.is_file():
-            mesh = control.mesh_in(scene.description).mesh
-            materials = control.materials_in(scene.description)
+            mesh = control.get_mesh(scene.description).mesh
+            materials = control.list_materials(scene.description)
             faces = None
             if materials is not None:
                 faces = np.concatenate([mesh.materials[name] for name in materials])
             vertices = scene.description.object.mesh.vertices
             scale = size / float(np.ptp(vertices, axis=0).max())
             texture = read_png(texture_file)
-            pieces.extend(_charts(control.name, texture, mesh, faces, scale))
+            pieces.extend(_find_charts(control.name, texture, mesh, faces, scale))
     if not pieces:
         raise InputError(
             f"{folder}: it has neither a texture nor a patch, so that "
@@ -207,7 +216,7 @@ def printable(run: str | Path, size: float) -> list[Piece]:
     return pieces
 
 
-def _relative_patch_size(
+def _get_relative_patch_size(
     control: Control, config: AttackConfig, summary: AttackSummary
 ) -> float:
     """Return the size of a patch relative to the object: as found, fixed or default."""
@@ -226,8 +235,8 @@ def _relative_patch_size(
     return float(size)
 
 
-def _charts(
-    name: str, texture: Floats, mesh: Mesh, faces: Ints | None, scale: float
+def _find_charts(
+    name: str, texture: Float32Array, mesh: Mesh, faces: IntArray | None, scale: float
 ) -> Iterator[Piece]:
     """Yield the connected parts of a texture as seen from outside, the largest first.
 
@@ -238,15 +247,15 @@ def _charts(
         faces: indices of the faces whose parts are printed; None for all.
         scale: millimetres per mesh unit.
     """
-    uv_areas = doubled_areas(mesh.uvs[mesh.faces].astype(np.float64))
-    raster = rasterised(mesh, (texture.shape[0], texture.shape[1]))
-    positions = raster.positions().astype(np.float64)
-    is_printed = raster.covered
+    uv_areas = compute_doubled_areas(mesh.uvs[mesh.faces].astype(np.float64))
+    raster = rasterize_charts(mesh, (texture.shape[0], texture.shape[1]))
+    positions = raster.compute_positions().astype(np.float64)
+    is_printed = raster.is_covered
     if faces is not None:
         is_printed = is_printed & np.isin(raster.face, faces)
     charts = _label_charts(is_printed)
     for number, (box, inside) in enumerate(charts, 1):
-        measured = _texel_size(positions[box] * scale, inside)
+        measured = _measure_texel_size(positions[box] * scale, inside)
         if measured is None:
             continue
         texel_size, distortion = measured
@@ -258,7 +267,7 @@ def _charts(
         title = name if len(charts) == 1 else f"{name}, piece {number}"
         if distortion >= 0.005:
             title += f" (sizes within it differ by {100 * distortion:.0f} %)"
-        yield _piece(title, image, texel_size, inside)
+        yield _make_piece(title, image, texel_size, inside)
 
 
 def _label_charts(is_printed: Mask) -> list[tuple[tuple[slice, slice], Mask]]:
@@ -273,17 +282,17 @@ def _label_charts(is_printed: Mask) -> list[tuple[tuple[slice, slice], Mask]]:
     return sorted(charts, key=lambda chart: -int(chart[1].sum()))
 
 
-def _extend_inside(image: Floats, inside: Mask) -> Floats:
+def _extend_inside(image: Float32Array, inside: Mask) -> Float32Array:
     """Replace the pixels outside a mask by the nearest ones inside."""
     nearest_inside = ndimage.distance_transform_edt(
         ~inside, return_distances=False, return_indices=True
     )
-    extended: Floats = image[tuple(nearest_inside)]
+    extended: Float32Array = image[tuple(nearest_inside)]
     return extended
 
 
-def _texel_size(
-    positions: Floats, inside: Mask
+def _measure_texel_size(
+    positions: Float32Array, inside: Mask
 ) -> tuple[tuple[float, float], float] | None:
     """Measure the texels of a part on the surface.
 
@@ -312,8 +321,8 @@ def _texel_size(
     return (width, height), distortion
 
 
-def _piece(
-    name: str, image: Floats, pixel_size: tuple[float, float], inside: Mask | None
+def _make_piece(
+    name: str, image: Float32Array, pixel_size: tuple[float, float], inside: Mask | None
 ) -> Piece:
     """Return a piece to print, with fine enough pixels and a margin of bleed.
 
@@ -324,12 +333,12 @@ def _piece(
         inside: (h, w) bool, what is cut out; None for the full image.
     """
     subdivisions = 1
-    if max(pixel_size) > FINEST:
+    if max(pixel_size) > MAX_PIXEL_SIZE:
         # The next odd number.
-        odd = 2 * math.ceil((max(pixel_size) / FINEST - 1.0) / 2.0) + 1
-        subdivisions = min(MOST_PARTS, odd)
+        odd = 2 * math.ceil((max(pixel_size) / MAX_PIXEL_SIZE - 1.0) / 2.0) + 1
+        subdivisions = min(MAX_SUBDIVISIONS, odd)
     if subdivisions > 1:
-        fine = enlarged(torch.from_numpy(np.ascontiguousarray(image)), subdivisions)
+        fine = enlarge(torch.from_numpy(np.ascontiguousarray(image)), subdivisions)
     else:
         fine = torch.from_numpy(image)
     size = pixel_size[0] / subdivisions, pixel_size[1] / subdivisions

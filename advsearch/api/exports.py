@@ -4,12 +4,12 @@ stored images, printed sheets.
 
 from __future__ import annotations
 
-from advsearch.api.chart import chart_page as chart_page
+from advsearch.api.chart import draw_chart_page as draw_chart_page
 from advsearch.api.export import AdversarialRun as AdversarialRun
-from advsearch.api.export import printable as printable
-from advsearch.api.export import real_size as real_size
+from advsearch.api.export import get_real_size as get_real_size
+from advsearch.api.export import make_printable_pieces as make_printable_pieces
 from advsearch.api.rendered_rows import render_rows as render_rows
-from advsearch.options import rounded as rounded
+from advsearch.options import format_rounded as format_rounded
 from advsearch.report.sheets import MOST_SHEETS as MOST_SHEETS
 from advsearch.report.sheets import write_sheets as write_sheets
 from advsearch.viewer import thumbnails as thumbnails

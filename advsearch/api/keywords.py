@@ -1,8 +1,8 @@
 """Turn the settings of each experiment into keywords for Python callers.
 
 A setting is declared once: its default, its range, its description. In Python it may
-take more than the text of a file (`hint_of`). Signatures and docstrings are made from
-both (`asks`). Type checkers see the keywords of `attack` and `sweep` in code:
+take more than the text of a file (`make_hint`). Signatures and docstrings are made from
+both (`with_settings_signature`). Type checkers see the keywords of `attack` and `sweep` in code:
 `SceneKeywords` and its subclasses.
 """
 
@@ -20,24 +20,24 @@ from typing import Any, Literal, TypedDict, TypeVar
 import numpy as np
 from torch import nn
 
-from advsearch.calls import check_types, unexpected
-from advsearch.config import SEVERAL
+from advsearch.calls import check_types, make_unexpected_error
+from advsearch.config import LIST_SETTINGS
 from advsearch.engine import loading
 from advsearch.engine.naming import (
     CONTROL,
     MODEL,
     SCENE,
-    check_not_of_scene,
-    check_not_spread,
-    exists_here,
-    in_turn,
-    model_name,
+    check_no_scene_settings,
+    check_no_worker_settings,
+    get_model_name,
+    hold_process_lock,
+    is_session_only,
 )
 from advsearch.errors import InputError
 from advsearch.models import Model
-from advsearch.options import told
+from advsearch.options import describe_value
 from advsearch.progress import watched
-from advsearch.settings import Config, PythonOnly, as_python, settings
+from advsearch.settings import Config, PythonOnly, settings, to_python
 from advsearch.trust.code import allow_named
 from advsearch.trust.stored_files import is_shallow
 
@@ -99,20 +99,22 @@ class _Signature(inspect.Signature):
         return str(self.short.format(**options))
 
 
-ONLY_BY_NAME = inspect.Parameter.KEYWORD_ONLY
+KEYWORD_ONLY = inspect.Parameter.KEYWORD_ONLY
 RUN = {
     "run": inspect.Parameter(
-        "run", ONLY_BY_NAME, default=None, annotation="str | Path | None"
+        "run", KEYWORD_ONLY, default=None, annotation="str | Path | None"
     )
 }
-KEPT = "The run is kept, in `run` or under runs/."
-SAME = {
+RUN_STORED = "The run is kept, in `run` or under runs/."
+SHARED_ARGUMENTS = {
     "object": "from `load_scene`, or the name of an object, or a file of one.",
     "model": "from `load_model`, or what that takes.",
     "progress": "True shows a bar, False none, None one on a terminal; or told how far "
     "it is.",
 }
-RAISED = "InputError: anything that the caller can put right; nothing is written then."
+SHARED_ERRORS = (
+    "InputError: anything that the caller can put right; nothing is written then."
+)
 """What the docstrings of many questions say alike: of the run, of arguments, and of
 errors.
 """
@@ -120,7 +122,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 ConfigType = TypeVar("ConfigType", bound=Config)
 
 
-def asks(config: type[Config]) -> Callable[[Function], Function]:
+def with_settings_signature(config: type[Config]) -> Callable[[Function], Function]:
     """Give a function that takes settings as `**settings` their signature and docstring.
 
     Every setting becomes a keyword with its declared default, and a line among the
@@ -140,10 +142,12 @@ def asks(config: type[Config]) -> Callable[[Function], Function]:
             name = setting.field.removesuffix("_")
             if name in own_signature.parameters or setting.required:
                 continue
-            hint = hint_of(setting.field, config.model_fields[setting.field].annotation)
+            hint = make_hint(
+                setting.field, config.model_fields[setting.field].annotation
+            )
             added_parameters.append(
                 inspect.Parameter(
-                    name, ONLY_BY_NAME, default=setting.default, annotation=hint
+                    name, KEYWORD_ONLY, default=setting.default, annotation=hint
                 )
             )
             line = f"{name}: {setting.text}"
@@ -159,12 +163,12 @@ def asks(config: type[Config]) -> Callable[[Function], Function]:
             _check_call(function.__name__, signature, args, keywords)
             plain_keywords = {
                 key: value
-                if key in PASSED_AS_GIVEN or not is_shallow(value)
-                else as_python(value)
+                if key in UNCONVERTED_ARGUMENTS or not is_shallow(value)
+                else to_python(value)
                 for key, value in keywords.items()
             }
             with ExitStack() as stack:
-                stack.enter_context(in_turn())
+                stack.enter_context(hold_process_lock())
                 if "progress" in own_signature.parameters:
                     progress = watched(plain_keywords.get("progress"))
                     plain_keywords["progress"] = stack.enter_context(progress)
@@ -173,7 +177,7 @@ def asks(config: type[Config]) -> Callable[[Function], Function]:
                         _check_name(function.__name__, key, plain_keywords[key])
                 return function(*args, **plain_keywords)
 
-        wrapper.__doc__ = _docstring(
+        wrapper.__doc__ = _make_docstring(
             function.__doc__ or "",
             [parameter.name for parameter in own_parameters],
             config.command,
@@ -185,7 +189,7 @@ def asks(config: type[Config]) -> Callable[[Function], Function]:
     return decorate
 
 
-PASSED_AS_GIVEN = ("scene", "model", "beside", "progress", "metrics", "tracker")
+UNCONVERTED_ARGUMENTS = ("scene", "model", "beside", "progress", "metrics", "tracker")
 """Arguments that are passed on unchanged; others become plain Python values."""
 
 
@@ -201,7 +205,7 @@ def _check_call(
         TypeError: there is no such argument, or one is missing.
         InputError: a value is of another type.
     """
-    error = unexpected(name, keywords, list(signature.parameters))
+    error = make_unexpected_error(name, keywords, list(signature.parameters))
     if error:
         raise error
     own_parameters = signature.short.parameters
@@ -219,12 +223,12 @@ def _check_name(function_name: str, key: str, value: object) -> None:
     if not isinstance(value, (str, Mapping, type(None))):
         raise InputError(
             f"{key}: expected a name for {function_name}, got "
-            f"{told(value)}; `attack` "
+            f"{describe_value(value)}; `attack` "
             "takes your own, and `sweep` a task of your own"
         )
 
 
-WRITTEN = {
+PYTHON_HINTS = {
     "controls": "Controls",
     "over": "Controls",
     "label": "int | np.integer[Any] | Names | None",
@@ -234,11 +238,20 @@ WRITTEN = {
     "value_range": "str | Sequence[float] | None",
 }
 """Annotations of settings that take other values in Python than they are stored as."""
-LISTED = (*SEVERAL, "prompt", "vary", "ways", "quantities", "samplers", "case", "group")
+PYTHON_LIST_SETTINGS = (
+    *LIST_SETTINGS,
+    "prompt",
+    "vary",
+    "ways",
+    "quantities",
+    "samplers",
+    "case",
+    "group",
+)
 """Settings that may be a list of names."""
 
 
-def hint_of(field: str, kind: Any) -> str:
+def make_hint(field: str, kind: Any) -> str:
     """Return the annotation of a setting for Python callers.
 
     Args:
@@ -251,14 +264,14 @@ def hint_of(field: str, kind: Any) -> str:
     # Constraints are no part of a hint.
     text = re.sub(r"Annotated\[(\w+), .*?\]\)\]", r"\1", text)
     # The label of a recipe may be a mapping from objects.
-    if field in WRITTEN and not (field == "label" and "dict" in text):
-        return WRITTEN[field]
+    if field in PYTHON_HINTS and not (field == "label" and "dict" in text):
+        return PYTHON_HINTS[field]
     optional = re.fullmatch(r"Optional\[(.*)\]", text)
     if optional:
         types = [optional[1], "None"]
     else:
         types = re.split(r" \| (?![^\[]*\])", text)
-    string_hint = "Path | Names" if field in LISTED else "str | Path"
+    string_hint = "Path | Names" if field in PYTHON_LIST_SETTINGS else "str | Path"
     hints = []
     for type_name in types:
         hint = string_hint if type_name == "str" else type_name
@@ -266,33 +279,33 @@ def hint_of(field: str, kind: Any) -> str:
     return " | ".join(hints)
 
 
-def _docstring(
+def _make_docstring(
     text: str, names: Sequence[str], command: str, settings: Sequence[str]
 ) -> str:
     """Complete the docstring of an experiment's function.
 
     Args:
-        text: its own docstring: what it does, and arguments that `SAME` does not have.
+        text: its own docstring: what it does, and arguments that `SHARED_ARGUMENTS` does not have.
         names: of its own arguments.
         command: of the experiment.
         settings: a line for each setting.
     """
     summary, _, own_arguments = inspect.cleandoc(text).partition("\n\nArgs:\n")
     if "other arguments are the settings of" not in " ".join(summary.split()):
-        summary += (
-            f"\n\nAll other arguments are the settings of `advsearch {command}`. {KEPT}"
-        )
+        summary += f"\n\nAll other arguments are the settings of `advsearch {command}`. {RUN_STORED}"
     described = {
         entry.partition(":")[0]: entry.rstrip()
         for entry in re.split(r"(?m)^(?=\w+: )", textwrap.dedent(own_arguments))
         if entry
     }
-    lines = [described.get(name, f"{name}: {SAME.get(name)}") for name in names]
+    lines = [
+        described.get(name, f"{name}: {SHARED_ARGUMENTS.get(name)}") for name in names
+    ]
     arguments = textwrap.indent("\n".join([*lines, *settings]), "    ")
-    return f"{summary}\n\nArgs:\n{arguments}\n\nRaises:\n    {RAISED}"
+    return f"{summary}\n\nArgs:\n{arguments}\n\nRaises:\n    {SHARED_ERRORS}"
 
 
-def configured(config: type[ConfigType], **keywords: Any) -> ConfigType:
+def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
     """Create a configuration from settings as Python callers pass them; None counts as
     not passed.
 
@@ -306,32 +319,37 @@ def configured(config: type[ConfigType], **keywords: Any) -> ConfigType:
     scene = settings.get("object")
     model = settings.get("model")
     if isinstance(scene, loading.Scene) or isinstance(model, (Model, nn.Module)):
-        check_not_spread(settings)
+        check_no_worker_settings(settings)
     if isinstance(model, (Model, nn.Module)):
-        settings["model"] = model_name(model)
+        settings["model"] = get_model_name(model)
         objects[MODEL, settings["model"]] = model
-        if exists_here(model):
+        if is_session_only(model):
             python_only.append(PythonOnly("model", settings["model"]))
     if isinstance(scene, loading.Scene):
-        check_not_of_scene(
+        check_no_scene_settings(
             {name: value for name, value in settings.items() if name != "object"}
         )
-        scene_settings = loading.scene_as_settings(scene)
+        scene_settings = loading.scene_to_settings(scene)
         settings |= {
             name: value for name, value in scene_settings.items() if value is not None
         }
         objects[SCENE, settings["object"]] = scene
-        if scene.only_here:
+        if scene.is_session_only:
             python_only.append(PythonOnly("scene"))
     for name in ("controls", "over"):
         controls: Any = settings.get(name)
-        instances = loading.instances_in(controls)
+        instances = loading.list_control_instances(controls)
         if instances or isinstance(controls, Mapping):
-            if loading.only_here(controls):
-                check_not_spread(settings)
+            if loading.list_session_only_controls(controls):
+                check_no_worker_settings(settings)
             objects |= {(CONTROL, control.name): control for control in instances}
             python_only += [
-                PythonOnly("control", kind) for kind in loading.only_here(instances)
+                PythonOnly("control", kind)
+                for kind in loading.list_session_only_controls(instances)
             ]
-            settings[name] = loading.settings_of(controls)
-    return config(**settings).with_python_objects(objects).with_only_here(python_only)
+            settings[name] = loading.controls_to_settings(controls)
+    return (
+        config(**settings)
+        .with_python_objects(objects)
+        .with_python_only_parts(python_only)
+    )

@@ -42,7 +42,7 @@ def check_names(config: Config) -> None:
     Raises:
         UnknownNameError, InputError: nothing has such a name.
     """
-    if config.only_here:
+    if config.python_only_parts:
         return  # objects of a Python session may have any name
     values: dict[str, Any] = {
         name: getattr(config, name) for name in type(config).model_fields
@@ -53,13 +53,13 @@ def check_names(config: Config) -> None:
         value = values.get(setting) or ""
         name = str(value.get("name", "") if isinstance(value, Mapping) else value)
         names = name.split("+") if setting == "task" else [name]
-        _check(setting, names, group)
+        _check_words(setting, names, group)
     like_reference = [
         name
         for name in split_names(values.get("model") or "")
         if resembling(name, ["reference"])
     ]
-    _check(
+    _check_words(
         "model",
         like_reference,
         ["reference"],
@@ -67,7 +67,7 @@ def check_names(config: Config) -> None:
     )
     labels = values.get("labels")
     if labels and WORD.fullmatch(labels) and not Path(labels).exists():
-        _check(
+        _check_words(
             "set of labels",
             [labels],
             LABEL_SETS,
@@ -99,13 +99,13 @@ def _check_scene(values: Mapping[str, Any]) -> None:
         *split_names(values.get("environment") or ""),
         *split_names(values.get("held_out_environment") or ""),
     ]
-    _check(
+    _check_words(
         "object",
         [name for name in objects if name != "all"],
         list_objects(),
         OBJECT_HINT,
     )
-    _check(
+    _check_words(
         "environment",
         [name for name in environments if name != "none"],
         list_environments(),
@@ -153,7 +153,7 @@ def _check_controls(values: Mapping[str, Any]) -> None:
         for name in names
         if name not in PARAMETERS and resembling(name, built_in_controls)
     ]
-    _check("control", like_controls, "controls")
+    _check_words("control", like_controls, "controls")
 
 
 def _check_suite(suite: str) -> None:
@@ -171,7 +171,7 @@ def _check_suite(suite: str) -> None:
     raise InputError(f"suite: there is no file {suite}{hint}")
 
 
-def _check(
+def _check_words(
     kind: str, names: Iterable[str], known: Iterable[str], hint: str = ""
 ) -> None:
     """Raise UnknownNameError if a word is none of the known names.

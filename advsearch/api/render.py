@@ -18,22 +18,22 @@ import torch
 from torch import Tensor, nn
 
 from advsearch import models
-from advsearch.calls import helped
+from advsearch.calls import with_checked_arguments
 from advsearch.config import RenderConfig
 from advsearch.engine import rendering
 from advsearch.engine.naming import (
     check_run_settings,
-    given_to,
-    in_turn,
+    hold_process_lock,
+    load_configured_scene,
     load_models,
-    scene_of,
+    make_configured_controls,
 )
 from advsearch.engine.rendering import Rendering as Rendering
-from advsearch.engine.rendering import writable
+from advsearch.engine.rendering import check_image_path
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.progress import NullProgress, Progress, shows_progress
-from advsearch.questions.attack.carry_out import parts_in
+from advsearch.questions.attack.carry_out import load_parts_of_run
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.sweep.result import SweepResult
@@ -42,7 +42,7 @@ from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
 from advsearch.runs.files import read_png
 from advsearch.runs.results import RenderResult, Result
 from advsearch.runs.summary import read_configuration, read_result
-from advsearch.scene.formation import aovs_of
+from advsearch.scene.formation import parse_aovs
 from advsearch.scene.importing.hdr import read_exr
 from advsearch.tasks import AnyTask, make_task
 from advsearch.trust.code import allow_named, names_code
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from advsearch.models.model import Read
 
 
-@helped
+@with_checked_arguments
 def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
     """Return the result of a run from its folder, of the type that the function of its
     question returns.
@@ -97,7 +97,7 @@ def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
         adversarial=torch.from_numpy(adversarial),
         artifacts=artifacts,
         search=None,
-        parts=cache(partial(parts_in, path)),
+        parts=cache(partial(load_parts_of_run, path)),
     )
 
 
@@ -132,8 +132,10 @@ def load_model(
 
 load_model.__doc__ = models.load_model.__doc__
 load_model.__signature__ = inspect.signature(models.load_model)  # type: ignore[attr-defined]
-load_model = helped(load_model)
-render = names_code(helped(in_turn()(shows_progress(rendering.render))))
+load_model = with_checked_arguments(load_model)
+render = names_code(
+    with_checked_arguments(hold_process_lock()(shows_progress(rendering.render)))
+)
 
 
 def render_picture_file(
@@ -144,8 +146,8 @@ def render_picture_file(
     read, StorageError where it could not be written.
     """
     progress = progress or NullProgress()
-    out = writable(config.out, config.around or 1)
-    aovs = aovs_of(config.aov)
+    out = check_image_path(config.out, config.around or 1)
+    aovs = parse_aovs(config.aov)
     if aovs and config.around is not None:
         raise InputError("aov: is of one view; leave `around` out")
     for spec in (config.object, config.environment, config.model, config.labels):
@@ -160,8 +162,8 @@ def render_picture_file(
             )
     progress.stage("loading the scene and the model")
     check_run_settings(config)
-    controls = given_to(config, config.controls)
-    scene = scene_of(config)
+    controls = make_configured_controls(config, config.controls)
+    scene = load_configured_scene(config)
     task = make_task(config.task)
     (model,), notes = load_models([config.model], task, config)
     rendering = render(

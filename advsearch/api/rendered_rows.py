@@ -13,30 +13,30 @@ from torch import Tensor
 
 from advsearch.config import SceneConfig
 from advsearch.engine.loading import Scene
-from advsearch.engine.rendering import facts_about
-from advsearch.engine.verifier import kept_configuration
+from advsearch.engine.rendering import make_facts
+from advsearch.engine.verifier import read_stored_configuration
 from advsearch.errors import FileFormatError, InputError
 from advsearch.options import Value
 from advsearch.progress import Progress
 from advsearch.questions.attack.carry_out import (
     ROLES_IN_SEARCH,
-    parts_in,
-    problem_of_parts,
+    load_parts_of_run,
+    make_problem_with_warnings,
 )
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import attack_of
-from advsearch.questions.sweep.carry_out import scenes_of
-from advsearch.questions.sweep.job import KIND, OpenScenes
+from advsearch.questions.attack.summary import load_attack_summary
+from advsearch.questions.sweep.carry_out import load_scenes_of_sweep
+from advsearch.questions.sweep.job import KIND, SceneLoader
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, read_python_only
 from advsearch.runs.store import NAME, Row, Store
-from advsearch.scene.outlines import SeenThing, seen_things
+from advsearch.scene.outlines import VisibleMesh, find_visible_meshes
 from advsearch.scene.renderer import Renderer
 from advsearch.settings import read_yaml
 from advsearch.tasks import Facts, Task
 
 # Kinds of rows of an attack with the clean scene.
-CLEAN = ("first control", "control")
+CLEAN_KINDS = ("first control", "control")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class RenderedRow:
         u: (d,), the configuration.
         rows: of the run's models.
         values: the configuration by parameter.
-        same: whether the first model is right, or wrong, as in its row.
+        is_reproduced: whether the first model is right, or wrong, as in its row.
     """
 
     name: str
@@ -63,15 +63,15 @@ class RenderedRow:
     u: Tensor
     rows: Sequence[Row]
     values: Mapping[str, Value]
-    same: bool
+    is_reproduced: bool
 
-    def list_things(self) -> Sequence[SeenThing]:
+    def list_things(self) -> Sequence[VisibleMesh]:
         """Return the visible things in the image: the object, and the others."""
-        return seen_things(self.renderer, self.u)
+        return find_visible_meshes(self.renderer, self.u)
 
-    def label_of(self, thing: SeenThing) -> str:
+    def get_label(self, thing: VisibleMesh) -> str:
         """Return the label of a thing's mesh, or else its name."""
-        return self.renderer.scene.made[0].meshes[thing.name].label or thing.name
+        return self.renderer.scene.definition[0].meshes[thing.name].label or thing.name
 
 
 def render_rows(run: str, *, every: bool, progress: Progress) -> Iterator[RenderedRow]:
@@ -99,9 +99,9 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
                 yield replace(rendered, name=f"{part.name}-{rendered.name}")
         return
     command = str(read_yaml(folder / CONFIG).get("command"))
-    if command not in READ:
+    if command not in RENDERERS:
         raise InputError(
-            f"{folder}: expected a run of {' or '.join(READ)}, or one with such parts, "
+            f"{folder}: expected a run of {' or '.join(RENDERERS)}, or one with such parts, "
             f"got one of {command}"
         )
     missing = [
@@ -114,7 +114,7 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
             f"{folder}: {', '.join(missing)}: only the Python session that "
             "asked has what renders it"
         )
-    yield from READ[command](folder, every, progress)
+    yield from RENDERERS[command](folder, every, progress)
 
 
 def _render_sweep(
@@ -122,7 +122,7 @@ def _render_sweep(
 ) -> Iterator[RenderedRow]:
     """Render the images of a sweep."""
     config = SweepConfig.from_yaml(folder / CONFIG)
-    scenes = scenes_of(config.model_copy(update={"metrics": {}}))
+    scenes = load_scenes_of_sweep(config.model_copy(update={"metrics": {}}))
     job = scenes.job
     rows_of_image = _read_sweep_rows(folder, len(job.models))
     images = sorted(
@@ -130,7 +130,7 @@ def _render_sweep(
         for image, rows in rows_of_image.items()
         if every or not all(row.correct for row in rows)
     )
-    count = job.per_scene * len(job.places)
+    count = job.images_per_scene * len(job.scenes)
     if images and not 0 <= images[0] <= images[-1] < count:
         raise FileFormatError(
             f"{folder / NAME}: expected rows of its {count} "
@@ -144,25 +144,25 @@ def _render_sweep(
 
 
 def _render_sweep_image(
-    scenes: OpenScenes, image: int, rows: Sequence[Row]
+    scenes: SceneLoader, image: int, rows: Sequence[Row]
 ) -> RenderedRow:
     """Render one image of a sweep by its index."""
     job = scenes.job
-    view, (query, *_) = scenes.asked(image)
-    scene = job.places[view.number]
-    picture = view.picture(query)
+    view, (query, *_) = scenes.make_queries(image)
+    scene = job.scenes[view.number]
+    picture = view.render_image(query)
     first_model = [row.correct for row in rows if row.step % len(job.models) == 0]
     stored = first_model[0] if first_model else None
     return RenderedRow(
         name=f"{image:06d}",
         picture=picture,
         task=job.tasks[0],
-        facts=object_facts(scene.scene, scene.object, job.config),
-        renderer=view.renderers[job.sizes[0]],
+        facts=make_object_facts(scene.scene, scene.object, job.config),
+        renderer=view.renderers[job.image_sizes[0]],
         u=query.u,
         rows=rows,
         values=rows[0].values,
-        same=stored in (None, view.problems[0].judge(picture, query.u).right),
+        is_reproduced=stored in (None, view.problems[0].judge(picture, query.u).right),
     )
 
 
@@ -181,13 +181,13 @@ def _render_attack(
     """Render the trials of an attack's adversarial scene and of the clean one; the first
     of each if no condition varies.
     """
-    summary = attack_of(folder)
-    parts = parts_in(folder)
-    problem, _ = problem_of_parts(parts)
-    configuration_of_kind = dict.fromkeys(CLEAN, problem.domain.start)
+    summary = load_attack_summary(folder)
+    parts = load_parts_of_run(folder)
+    problem, _ = make_problem_with_warnings(parts)
+    configuration_of_kind = dict.fromkeys(CLEAN_KINDS, problem.domain.start)
     if summary.adversarial is not None:
         kind = "baseline verification" if summary.answer_from else "verification"
-        configuration_of_kind[kind] = kept_configuration(folder, problem)
+        configuration_of_kind[kind] = read_stored_configuration(folder, problem)
     rows = list[Row]()
     with Store(folder / NAME, read_only=True) as store:
         for kind in configuration_of_kind:
@@ -198,31 +198,31 @@ def _render_attack(
         u = configuration_of_kind[row.kind]
         seed = max(0, row.seed or 0)
         picture = problem.picture(u, seed, row.spp or problem.spp)
-        full_u = problem.whole(u, seed)
+        full_u = problem.add_conditions(u, seed)
         yield RenderedRow(
             name=f"{row.kind.replace(' ', '-')}-{row.step:02d}",
             picture=picture,
             task=problem.task,
-            facts=object_facts(parts.scene, parts.config.object, parts.config),
+            facts=make_object_facts(parts.scene, parts.config.object, parts.config),
             renderer=problem.renderer,
             u=full_u,
             rows=[row],
             values={**problem.describe(u, seed), **row.values},
-            same=row.correct in (None, problem.judge(picture, full_u).right),
+            is_reproduced=row.correct in (None, problem.judge(picture, full_u).right),
         )
         progress.advance(1)
 
 
-def object_facts(scene: Scene, name: str, config: SceneConfig) -> Facts:
+def make_object_facts(scene: Scene, name: str, config: SceneConfig) -> Facts:
     """Return the facts about the object, whatever thing the run judges.
 
     A label in the settings is that of the judged thing.
     """
     judges_object = config.judge not in scene.description.things
-    return facts_about(
+    return make_facts(
         scene.description, name, config.label if judges_object else None, dict
     )
 
 
-READ = {SweepConfig.command: _render_sweep, AttackConfig.command: _render_attack}
+RENDERERS = {SweepConfig.command: _render_sweep, AttackConfig.command: _render_attack}
 """The renderers of runs by command."""

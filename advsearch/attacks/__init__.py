@@ -21,7 +21,12 @@ from advsearch.attacks.policies.choices import Choices
 from advsearch.attacks.policies.evolution import CMAES, NES
 from advsearch.attacks.policies.pgd import PGD, Adam
 from advsearch.attacks.policies.sampling import Grid, Random, Sobol
-from advsearch.attacks.search import SearchResult, StepRecord, planned_renders, search
+from advsearch.attacks.search import (
+    SearchResult,
+    StepRecord,
+    count_planned_renders,
+    search,
+)
 from advsearch.attacks.trials import SampleCount, Trials, choose_spp
 from advsearch.attacks.verification import (
     Ending,
@@ -63,12 +68,12 @@ __all__ = [
     "Verification",
     "choose_spp",
     "clopper_pearson",
+    "count_planned_renders",
     "count_right",
     "draw_seed",
     "get_objective",
     "make_policy",
     "margin",
-    "planned_renders",
     "run_trials",
     "search",
     "seeded",

@@ -17,7 +17,7 @@ from torch import Tensor
 from advsearch.attacks.domain import Domain
 from advsearch.errors import InputError
 from advsearch.statistics.intervals import CONFIDENCE
-from advsearch.statistics.sequential import edge_of
+from advsearch.statistics.sequential import find_threshold
 
 # configurations that differ by less than this in every element are one candidate (an
 # 8-bit level is 4e-3)
@@ -34,25 +34,35 @@ class Candidate:
     u: Tensor
     objective: float
     success: bool
-    again: tuple[float, ...] = ()
+    repeat_objectives: tuple[float, ...] = ()
     successes: int = 0
 
     @property
-    def believed(self) -> float:
+    def mean_objective(self) -> float:
         """Mean objective of the new renders; the raw one if there are none."""
-        return math.fsum(self.again) / len(self.again) if self.again else self.objective
+        return (
+            math.fsum(self.repeat_objectives) / len(self.repeat_objectives)
+            if self.repeat_objectives
+            else self.objective
+        )
 
     @property
-    def rate(self) -> float:
-        return self.successes / len(self.again) if self.again else float(self.success)
+    def success_rate(self) -> float:
+        return (
+            self.successes / len(self.repeat_objectives)
+            if self.repeat_objectives
+            else float(self.success)
+        )
 
-    def seen_again(self, objective: float, success: bool) -> Candidate:
+    def with_repeat(self, objective: float, success: bool) -> Candidate:
         return replace(
-            self, again=(*self.again, objective), successes=self.successes + success
+            self,
+            repeat_objectives=(*self.repeat_objectives, objective),
+            successes=self.successes + success,
         )
 
 
-def admit(
+def add_candidate(
     pool: tuple[Candidate, ...], new: Candidate, size: int
 ) -> tuple[Candidate, ...]:
     """Return the pool with `new` in it if it belongs to the best `size` distinct ones,
@@ -64,7 +74,7 @@ def admit(
     """
     for old in pool:
         if torch.equal(old.u, new.u):
-            looked = old.seen_again(new.objective, new.success)
+            looked = old.with_repeat(new.objective, new.success)
             return tuple(
                 looked if candidate is old else candidate for candidate in pool
             )
@@ -79,7 +89,7 @@ def admit(
     return tuple(sorted((*pool, new), key=_raw, reverse=True)[:size])
 
 
-def with_last(
+def replace_worst(
     pool: tuple[Candidate, ...], last: Candidate | None, size: int
 ) -> tuple[Candidate, ...]:
     """Return the pool, of at most `size`, with the last configuration of a search in
@@ -90,7 +100,9 @@ def with_last(
     return (*pool[: size - 1], last)
 
 
-def contenders(pool: tuple[Candidate, ...], shared: int) -> tuple[Candidate, ...]:
+def select_contenders(
+    pool: tuple[Candidate, ...], shared: int
+) -> tuple[Candidate, ...]:
     """Return the winner so far and those that are not clearly worse, in their order:
     the mean of their differences from the winner, seed by seed, in the last `shared`
     renders, is larger than the standard error of that mean, and their success rate is
@@ -99,32 +111,39 @@ def contenders(pool: tuple[Candidate, ...], shared: int) -> tuple[Candidate, ...
     """
     if shared < 2 or len(pool) < 2:
         return pool
-    leader = best(pool)
+    leader = select_best(pool)
 
     def worse(candidate: Candidate) -> bool:
         behind = [
             a - b
             for a, b in zip(
-                leader.again[-shared:], candidate.again[-shared:], strict=True
+                leader.repeat_objectives[-shared:],
+                candidate.repeat_objectives[-shared:],
+                strict=True,
             )
         ]
         if not all(map(math.isfinite, behind)):
-            return not math.isfinite(candidate.believed)
+            return not math.isfinite(candidate.mean_objective)
         mean = math.fsum(behind) / shared
         variance = math.fsum((each - mean) ** 2 for each in behind) / (shared - 1)
-        return candidate.rate <= leader.rate and mean > math.sqrt(variance / shared)
+        return candidate.success_rate <= leader.success_rate and mean > math.sqrt(
+            variance / shared
+        )
 
     return tuple(
         candidate for candidate in pool if candidate is leader or not worse(candidate)
     )
 
 
-def best(pool: tuple[Candidate, ...]) -> Candidate:
+def select_best(pool: tuple[Candidate, ...]) -> Candidate:
     """Return the winner: by success rate, then by objective, of new renders where all
     have had some.
     """
-    if all(candidate.again for candidate in pool):
-        return max(pool, key=lambda candidate: (candidate.rate, candidate.believed))
+    if all(candidate.repeat_objectives for candidate in pool):
+        return max(
+            pool,
+            key=lambda candidate: (candidate.success_rate, candidate.mean_objective),
+        )
     return pool[0]
 
 
@@ -139,7 +158,7 @@ BETS = 8
 
 
 @dataclass(frozen=True)
-class FailureShare:
+class FailureRate:
     """The share of configurations, drawn evenly from the budget, in which one render of
     the search is a success: the mean of the weighted draws (None where `effective` is
     under `LEAST_EFFECTIVE`, or a draw could not be evaluated); an interval that covers
@@ -154,9 +173,9 @@ class FailureShare:
     draws: int
 
 
-def failure_share(
+def estimate_failure_rate(
     weights: Tensor, bounds: Tensor, failed: Tensor, unknown: Tensor
-) -> FailureShare:
+) -> FailureRate:
     """Return what draws from changing densities say of the share of failures under the
     even one.
 
@@ -202,8 +221,8 @@ def failure_share(
     total = float(low.sum())
     effective = total**2 / float(low.square().sum()) if total else 0.0
     stated = effective >= LEAST_EFFECTIVE and not bool(unknown.any())
-    ends = edge_of(lambda p: not against_low(p)), edge_of(against_high)
-    return FailureShare(
+    ends = find_threshold(lambda p: not against_low(p)), find_threshold(against_high)
+    return FailureRate(
         min(1.0, total / len(low)) if stated else None, ends, effective, len(low)
     )
 
@@ -231,34 +250,38 @@ class Failures:
     where that can be told.
     """
 
-    listed: tuple[FoundFailure, ...]
+    examples: tuple[FoundFailure, ...]
     over: tuple[int, ...]
-    found: int
-    seen: int
-    places: int | None
-    share: FailureShare | None = None
+    n_failures: int
+    n_visited: int
+    n_cells: int | None
+    failure_rate: FailureRate | None = None
 
 
-def most_different(
-    at: Tensor, worst: Sequence[float], around: Tensor, apart: Tensor, most: int = MOST
+def select_diverse(
+    points: Tensor,
+    objectives: Sequence[float],
+    is_periodic: Tensor,
+    is_discrete: Tensor,
+    limit: int = MOST,
 ) -> list[int]:
     """Return which to list, at places (n, k) in shares of each range: the worst first,
     then each time the one that is farthest from all before it. That is the greedy
     choice of k centres, whose largest distance is at most twice the least possible
     (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance"). The
-    ends of ranges `around` (k,) are the same place; different choices, `apart` (k,),
+    ends of ranges `is_periodic` (k,) are the same place; different choices, `is_discrete` (k,),
     lie 1 apart. Of equals the worse one goes first.
     """
-    order = sorted(range(len(at)), key=lambda number: -worst[number])
-    at = at[order].double()
-    nearest = torch.full((len(at),), torch.inf, dtype=torch.float64)
+    order = sorted(range(len(points)), key=lambda number: -objectives[number])
+    points = points[order].double()
+    nearest = torch.full((len(points),), torch.inf, dtype=torch.float64)
     picked = list[int]()
-    for _ in range(min(most, len(at))):
+    for _ in range(min(limit, len(points))):
         chosen = int(nearest.argmax())
         picked.append(chosen)
-        away = (at - at[chosen]).abs()
-        away = torch.where(around, torch.minimum(away, 1.0 - away), away)
-        away = torch.where(apart, (away > 0.0).double(), away)
+        away = (points - points[chosen]).abs()
+        away = torch.where(is_periodic, torch.minimum(away, 1.0 - away), away)
+        away = torch.where(is_discrete, (away > 0.0).double(), away)
         nearest = torch.minimum(nearest, away.norm(dim=1))
         nearest[picked] = -1.0
     return [order[number] for number in picked]
@@ -301,7 +324,7 @@ nothing.
 class Bracket:
     """Where the smallest scale lies: a search found nothing at `low` (0 where none has
     failed), and `u` (d,) passes at `high`, infinity where nothing did; of the search
-    `found_by`; if `confirmed` it has passed again with new seeds.
+    `found_by`; if `confirm_bracket` it has passed again with new seeds.
     """
 
     low: float
@@ -313,12 +336,12 @@ class Bracket:
     confirmed: bool = False
 
     @property
-    def closed(self) -> bool:
+    def is_closed(self) -> bool:
         """Whether high is within `RATIO` of low."""
         return self.u is not None and self.high <= RATIO * (1.0 + 1e-9) * self.low
 
 
-def scaled(domain: Domain, scale: float) -> Domain:
+def scale_domain(domain: Domain, scale: float) -> Domain:
     """Return the domain with every budget multiplied by `scale`, in (0, 1]."""
     names = (
         block.name.partition(".")[0] for block in domain.blocks if block.epsilon is None
@@ -336,14 +359,14 @@ def scaled(domain: Domain, scale: float) -> Domain:
     return replace(domain, blocks=blocks)
 
 
-def shrunk(domain: Domain, u: Tensor, scale: float) -> Tensor:
+def shrink_towards_start(domain: Domain, u: Tensor, scale: float) -> Tensor:
     """Return the configuration moved towards the start, its change multiplied by
     `scale`.
     """
     return domain.project(domain.start + scale * (u - domain.start))
 
 
-def smallest(
+def find_smallest_change(
     search: Search, passes: Passes, domain: Domain, likely: Likely | None = None
 ) -> Bracket:
     """Bracket the smallest scale of the domain's budgets at which a configuration
@@ -380,7 +403,7 @@ def smallest(
         )
         if state.high <= RATIO**2 * state.low:
             scale = max(scale, state.high / RATIO)
-        u = search(scaled(domain, scale), state.searches)
+        u = search(scale_domain(domain, scale), state.searches)
         passed = passes(u, state.checks)
         if passed:
             state = replace(state, found_by=state.searches)
@@ -393,7 +416,7 @@ def smallest(
     return state
 
 
-def confirmed(
+def confirm_bracket(
     bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2
 ) -> Bracket:
     """Return the bracket with its upper end moved out until the configuration there
@@ -411,7 +434,7 @@ def confirmed(
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
         at *= math.sqrt(RATIO)
         high = min(1.0, reached * at)
-        farther = scaled(domain, high).project(
+        farther = scale_domain(domain, high).project(
             domain.start + at * (edge - domain.start)
         )
         bracket = replace(bracket, high=high, u=farther, checks=bracket.checks + times)
@@ -438,7 +461,7 @@ def _shorten(
     checks = state.checks
 
     def at(scale: float) -> Tensor:
-        return shrunk(scaled(domain, scale), u, scale / length)
+        return shrink_towards_start(scale_domain(domain, scale), u, scale / length)
 
     middle = math.sqrt(high * low)
     stride = math.inf

@@ -123,7 +123,7 @@ class Block:
         return min(float(self.epsilon or 0.0), reach)
 
     @property
-    def rounding(self) -> float:
+    def compute_rounding(self) -> float:
         """What rounding all elements of u to float32 may add to the l2 norm: half of
         the last bit of 1 for each, all the same way where a texture has one colour.
         """
@@ -154,7 +154,7 @@ class Domain:
     """
     # whether they are but for the conditions that each draws anew from a bank
     # (docs/transport.md)
-    drawn: bool = False
+    draws_conditions: bool = False
     first: Tensor | None = None
     """(d,) where a policy should begin, if not at the start; it moves no ball. For
     those that begin several times.
@@ -185,7 +185,7 @@ class Domain:
         object.__setattr__(self, "blocks", tuple(self.blocks))
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
-        for block, part in self.parts():
+        for block, part in self.list_block_slices():
             lower[part], upper[part] = block.low, block.high
             if not bool(
                 ((start[part] >= lower[part]) & (start[part] <= upper[part])).all()
@@ -238,11 +238,13 @@ class Domain:
             [block.options for block in self.blocks], dtype=torch.long
         ).repeat_interleave(sizes)
 
-    def block_of(self, place: int) -> Block:
+    def find_block(self, index: int) -> Block:
         """Return the block that an element of u belongs to."""
-        return next(block for block, part in self.parts() if place < part.stop)
+        return next(
+            block for block, part in self.list_block_slices() if index < part.stop
+        )
 
-    def parts(self) -> list[tuple[Block, slice]]:
+    def list_block_slices(self) -> list[tuple[Block, slice]]:
         """Return every block with its slice of u."""
         ends = [0, *accumulate(block.size for block in self.blocks)]
         return [
@@ -260,7 +262,7 @@ class Domain:
         """
         u = u.detach()
         projected = torch.clamp(u, self.lower, self.upper)
-        for block, part in self.parts():
+        for block, part in self.list_block_slices():
             if block.norm == "l2" and block.epsilon is not None:
                 projected[part] = project_l2_box(
                     u[part], self.start[part], block.epsilon, block.low, block.high
@@ -284,7 +286,7 @@ class Domain:
         1).
         """
         excess = float(torch.maximum(self.lower - u, u - self.upper).amax())
-        for block, part in self.parts():
+        for block, part in self.list_block_slices():
             if block.norm == "l2" and block.epsilon is not None:
                 norm = math.sqrt(
                     float(
@@ -293,7 +295,8 @@ class Domain:
                 )
                 excess = max(
                     excess,
-                    (norm - block.epsilon - block.rounding) / max(1.0, block.epsilon),
+                    (norm - block.epsilon - block.compute_rounding)
+                    / max(1.0, block.epsilon),
                 )
         return math.inf if math.isnan(excess) else max(0.0, excess)
 
@@ -319,10 +322,10 @@ class Domain:
         drawn = []
         for _ in range(n):
             u = torch.empty_like(self.start)
-            for block, part in self.parts():
+            for block, part in self.list_block_slices():
                 noise = torch.rand(block.size, generator=generator)
                 if block.options:
-                    noise = centre_of_option(noise, block.options)
+                    noise = option_center(noise, block.options)
                 elif extreme and block.norm != "box":
                     noise.round_()
                 if block.norm != "l2" or block.epsilon is None:
@@ -353,7 +356,7 @@ class Domain:
         - a discrete choice, and a block whose gradient is zero: nothing.
         """
         step = torch.empty_like(gradient)
-        for block, part in self.parts():
+        for block, part in self.list_block_slices():
             slope = gradient[part]
             if block.options:
                 step[part] = 0.0
@@ -374,7 +377,7 @@ class Domain:
         return step
 
 
-def centre_of_option(u: Tensor, options: Tensor | int) -> Tensor:
+def option_center(u: Tensor, options: Tensor | int) -> Tensor:
     """Return the middle of the option's share of [0, 1] in which u lies."""
     return (torch.floor(u * options).clamp_(max=options - 1) + 0.5) / options
 
@@ -390,7 +393,7 @@ _MAX_ITERATIONS = 100
 
 
 def project_l2_box(
-    u: Tensor, centre: Tensor, radius: float, low: float = 0.0, high: float = 1.0
+    u: Tensor, center: Tensor, radius: float, low: float = 0.0, high: float = 1.0
 ) -> Tensor:
     """Project onto the intersection of an l2 ball and a box.
 
@@ -420,7 +423,7 @@ def project_l2_box(
     squared_distance = 0.0
     squared_distance_in_box = 0.0
     for u_chunk, center_chunk in zip(
-        torch.split(u, CHUNK), torch.split(centre, CHUNK), strict=True
+        torch.split(u, CHUNK), torch.split(center, CHUNK), strict=True
     ):
         squares.append((u_chunk - center_chunk).square_())
         rooms.append(u_chunk.clamp(low, high).sub_(center_chunk).square_())
@@ -429,7 +432,7 @@ def project_l2_box(
     if squared_distance_in_box <= (radius * (1.0 + SLACK)) ** 2:
         return u.clamp(low, high)
     s = _solve_multiplier(squares, rooms, radius, radius**2 / squared_distance)
-    return _move_towards(centre, u, math.sqrt(s), low, high)
+    return _move_towards(center, u, math.sqrt(s), low, high)
 
 
 def _solve_multiplier(
@@ -490,7 +493,7 @@ class Distribution:
         )
 
 
-def half_widths(domain: Domain) -> Tensor:
+def compute_half_widths(domain: Domain) -> Tensor:
     """Return (d,) float32, over 0: how far each element may go while all others go as
     far.
 
@@ -501,7 +504,7 @@ def half_widths(domain: Domain) -> Tensor:
     bounds' distance.
     """
     half = (domain.upper - domain.lower) / 2.0
-    for block, part in domain.parts():
+    for block, part in domain.list_block_slices():
         if block.norm == "l2" or block.reach is not None:
             half[part] = min(
                 block.radius / math.sqrt(block.size), (block.high - block.low) / 2.0
@@ -509,7 +512,7 @@ def half_widths(domain: Domain) -> Tensor:
     return half.clamp_(min=torch.finfo(torch.float32).tiny)
 
 
-def wraps(domain: Domain) -> Tensor:
+def find_periodic(domain: Domain) -> Tensor:
     """Return (d,) bool: the elements that may leave their bounds, because there they
     come round again.
     """
@@ -539,15 +542,15 @@ SAMPLERS: tuple[str, ...] = get_args(Sampler)
 
 NET = 1 << 16  # points of one scrambled net
 # numbers of a Sobol point, at most: for so many Joe and Kuo give directions
-MOST_DIMENSIONS = 21201
+MAX_DIMENSIONS = 21201
 # numbers that are drawn at once, at most (unless one point has more)
-BLOCK_NUMBERS = 1 << 18
+MAX_BLOCK_VALUES = 1 << 18
 SEEDS = 1024  # seeds that are made at once
 
-Doubles = NDArray[np.float64]
+Float64Array = NDArray[np.float64]
 
 
-class Draws:
+class SampleSequence:
     """Points of [0, 1)^dimensions by number, by a sampler of `SAMPLERS`; their streams
     are called `name`.
     """
@@ -559,9 +562,9 @@ class Draws:
             raise InputError(
                 f"sampler: expected one of {', '.join(SAMPLERS)}, got {sampler!r}"
             )
-        if sampler == "sobol" and dimensions > MOST_DIMENSIONS:
+        if sampler == "sobol" and dimensions > MAX_DIMENSIONS:
             raise InputError(
-                f"`sampler` sobol: expected at most {MOST_DIMENSIONS} numbers to draw, "
+                f"`sampler` sobol: expected at most {MAX_DIMENSIONS} numbers to draw, "
                 f"got {dimensions}; use "
                 "`sampler=random`"
             )
@@ -569,14 +572,14 @@ class Draws:
         self._sampler = sampler
         self._seed = seed
         self._name = name
-        rows = max(1, min(NET, BLOCK_NUMBERS // max(1, dimensions)))
+        rows = max(1, min(NET, MAX_BLOCK_VALUES // max(1, dimensions)))
         self._rows = 1 << (rows.bit_length() - 1)
         self._number, self._block = -1, np.empty((0, dimensions))
         self._engine: Any = None
         self._net = -1
         self._drawn = 0
 
-    def points(self, first: int, count: int) -> Doubles:
+    def points(self, first: int, count: int) -> Float64Array:
         """Return the draws with the numbers from `first` on: (count, dimensions)
         float64 in [0, 1).
         """
@@ -600,7 +603,7 @@ class Draws:
             first += size
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def _sobol(self, number: int) -> Doubles:
+    def _sobol(self, number: int) -> Float64Array:
         # takes a quarter of a second, and few runs draw from nets
         from scipy.stats import qmc
 
@@ -616,7 +619,7 @@ class Draws:
         return np.asarray(self._engine.random(self._rows))
 
 
-class Seeds:
+class SeedSequence:
     """Seeds of one stream by number, many at once: much faster than
     `advsearch.seeds.stream` for every one.
     """
@@ -640,7 +643,7 @@ class Seeds:
 
 
 @dataclass(frozen=True)
-class Product:
+class ProductIndex:
     """The product of axes with so many values each, at least 1; the last runs fastest.
     No axis at all has one point.
     """
@@ -674,7 +677,7 @@ class Product:
         return number
 
 
-def batches(first: int, count: int, size: int) -> Iterator[range]:
+def split_into_batches(first: int, count: int, size: int) -> Iterator[range]:
     """Yield the numbers from `first` to `count` in batches that begin at multiples of
     `size`, so that they are those of somebody who started at 0; the first may be the
     rest of one.

@@ -32,18 +32,18 @@ zeros elsewhere.
 
 Phase = Literal["search", "ranking"]
 
-MOST = 1024
-MOST_NUMBERS = 2**21
+MAX_QUERIES = 1024
+MAX_COORDINATES = 2**21
 """Queries that are asked at once, and the numbers that their configurations have
 together, at most.
 """
 
 
-def most_at_once(dim: int) -> int:
+def max_batch_size(dim: int) -> int:
     """Return how many configurations of so many numbers are asked about at once, at
     most.
     """
-    return max(2, min(MOST, MOST_NUMBERS // dim))
+    return max(2, min(MAX_QUERIES, MAX_COORDINATES // dim))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,20 +72,20 @@ class Query:
     spp: int = 1  # of a trial: samples a pixel
     # of a trial: whether conditions are drawn; otherwise the scene has those it comes
     # with
-    drawn: bool = True
+    draws_conditions: bool = True
     values: Mapping[str, Value] = field(default_factory=dict)
     """Of a trial: what its row says of the configuration, which trials of one kind may
     have in common.
     """
     # of a trial: whether a search seeks some prediction there, so that there is a
     # success
-    sought: bool = True
-    wanted: Literal["judgement", "picture", "light"] = "judgement"
+    has_success: bool = True
+    product: Literal["judgement", "picture", "light"] = "judgement"
     """What the evaluation is: a judgement; a picture alone; or "light", from which
     pictures can be predicted (`advsearch.scene.transport`), at u of the whole space.
     """
     # whether it has the picture, too; of a row of a sweep, the bytes of a small one
-    keep: bool = False
+    with_image: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,23 +118,23 @@ class Evaluation:
     # 0 if its picture was rendered; samples a pixel of what predicted it, 1 of a matrix
     predicted: int = 0
     # JPEG file of the picture of a row of a sweep, where it is kept
-    small: bytes | None = None
+    jpeg: bytes | None = None
     # ground truth by name, and notes, where kept
     layers: tuple[Mapping[str, Any], Mapping[str, str]] | None = None
     # that it took; None where whoever asks has to look at the clock
     seconds: float | None = None
     # on which it was made, by its name among the workers'; None of one like this
     machine: str | None = None
-    lost: bool = False  # whether every worker that tried it died
+    is_lost: bool = False  # whether every worker that tried it died
 
     @classmethod
-    def of(cls, judgement: Judgement, **more: Any) -> Evaluation:
+    def from_judgement(cls, judgement: Judgement, **more: Any) -> Evaluation:
         """Return the answer to a query without derivative, from what the task says."""
         value = math.nan if judgement.objective is None else judgement.objective
         return cls(value, None, judgement.success, judgement=judgement, **more)
 
     @property
-    def said(self) -> Judgement:
+    def required_judgement(self) -> Judgement:
         """What the task says; a RuntimeError where there is no task, or something else
         was wanted.
         """
@@ -143,11 +143,11 @@ class Evaluation:
         return self.judgement
 
     @property
-    def finite(self) -> bool:
+    def is_finite(self) -> bool:
         """Whether the objective is a number that can be compared."""
         return math.isfinite(self.objective)
 
-    def usable(self) -> Evaluation:
+    def sanitize(self) -> Evaluation:
         """Return the evaluation as policies may see it: every number in it can be
         computed with.
 
@@ -170,7 +170,7 @@ class Evaluation:
                     gradient=gradient,
                     non_finite=evaluation.non_finite + bad,
                 )
-        if evaluation.finite:
+        if evaluation.is_finite:
             return evaluation
         zero = None if gradient is None else torch.zeros_like(gradient)
         return replace(evaluation, objective=-math.inf, gradient=zero, success=False)
@@ -207,19 +207,21 @@ class Proposal:
     step_size: float = math.nan
     samples: int = 1
 
-    def cost(self, domain: Domain) -> int:
+    def max_cost(self, domain: Domain) -> int:
         """Return the renders that this takes at most."""
         return self.samples * (
             1 + (domain.gradient_cost if self.gradient is True else 0)
         )
 
-    def affordable(self, domain: Domain, left: int) -> Proposal:
-        """Return the proposal as far as `left` renders, at least 1, allow: no more
+    def limit_cost(self, domain: Domain, renders_left: int) -> Proposal:
+        """Return the proposal as far as `renders_left` renders, at least 1, allow: no more
         samples than these, and no gradient after which no render would be left to use
         it.
         """
-        proposal = replace(self, samples=left) if self.samples > left else self
-        if proposal.gradient and proposal.cost(domain) >= left:
+        proposal = (
+            replace(self, samples=renders_left) if self.samples > renders_left else self
+        )
+        if proposal.gradient and proposal.max_cost(domain) >= renders_left:
             return replace(proposal, gradient=False)
         return proposal
 
@@ -359,7 +361,7 @@ def seeded(seed: int, number: int) -> torch.Generator:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def use_one_thread() -> Iterator[None]:
     """Let torch use one thread for a while: faster for small matrices, on a busy
     machine many times so, and the last bits are the same whatever the number of
     threads. Setting the number costs less than a microsecond.

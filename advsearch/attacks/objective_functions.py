@@ -26,13 +26,13 @@ from torch.nn import functional
 from advsearch.errors import InputError
 from advsearch.tasks.classification import (
     Labels,
-    largest,
-    members,
-    target_lead,
-    wrong_lead,
+    compute_largest_logit,
+    compute_target_lead,
+    compute_wrong_lead,
+    make_class_mask,
 )
 
-SUREST = -15.0
+MAX_LOG_ODDS = -15.0
 """Log-odds below which cross-entropy is continued by its tangent. In float32 its own
 slope, exp(log-odds), would be lost at -103 and count for nothing beside other numbers
 long before.
@@ -52,14 +52,14 @@ def margin(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     unbounded, and with a gradient of one at every confidence (Carlini and Wagner 2017,
     f_6 without its hinge). Ties share the gradient.
     """
-    return wrong_lead(logits, labels)
+    return compute_wrong_lead(logits, labels)
 
 
 def targeted_margin(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     """max over t in T of z_t, minus max over j not in T of z_j: over 0 exactly where
     the prediction is in T.
     """
-    return target_lead(logits, target)
+    return compute_target_lead(logits, target)
 
 
 def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
@@ -71,12 +71,12 @@ def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     configurations alike; between it and `margin` lies at most the logarithm of the
     number of classes.
     """
-    return _log_odds(logits, ~members(logits, labels))
+    return _log_odds(logits, ~make_class_mask(logits, labels))
 
 
 def targeted_log_odds(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     """log(p / (1 - p)) with p the total probability of T."""
-    return _log_odds(logits, members(logits, target, "target"))
+    return _log_odds(logits, make_class_mask(logits, target, "target"))
 
 
 def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
@@ -84,7 +84,7 @@ def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
 
     -log p = softplus(l) with l the `log_odds`: that form neither overflows for logits
     of thousands nor cancels where p is near 1. Its slope in l is 1 - p and would be
-    lost where the model is sure. So below l = `SUREST`, where the value is 3e-7, it
+    lost where the model is sure. So below l = `MAX_LOG_ODDS`, where the value is 3e-7, it
     is continued by its tangent: the slope stays 3e-7, and values get slightly under
     0. That is enough for policies that normalise their steps; `log_odds` has slope 1
     everywhere.
@@ -127,7 +127,7 @@ def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
         InputError: fewer than two wrong classes. Of two numbers only the order is left
             without scale and offset.
     """
-    top, spread = _sorted(logits, members(logits, labels), "label")
+    top, spread = _sorted(logits, make_class_mask(logits, labels), "label")
     difference = margin(logits, images, labels)
     wide = top[:, 0] - top[:, 2]
     return difference / _safe(torch.where(difference > 0.0, _wider(top), wide), spread)
@@ -140,7 +140,7 @@ def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     The targeted ratio of Croce and Hein 2020, section 4, whose numerator is z_t - z_y
     instead: that is over 0 also where a third class wins. Otherwise as `dlr`.
     """
-    top, spread = _sorted(logits, members(logits, target, "target"), "target")
+    top, spread = _sorted(logits, make_class_mask(logits, target, "target"), "target")
     return targeted_margin(logits, images, target) / _safe(_wider(top), spread)
 
 
@@ -150,10 +150,12 @@ def _log_odds(logits: Tensor, of: Tensor) -> Tensor:
 
 
 def _softplus(x: Tensor) -> Tensor:
-    """log(1 + exp(x)), continued by its tangent below `SUREST`."""
-    value = math.log1p(math.exp(SUREST))
-    slope = 1.0 / (1.0 + math.exp(-SUREST))
-    return torch.where(x < SUREST, value + slope * (x - SUREST), functional.softplus(x))
+    """log(1 + exp(x)), continued by its tangent below `MAX_LOG_ODDS`."""
+    value = math.log1p(math.exp(MAX_LOG_ODDS))
+    slope = 1.0 / (1.0 + math.exp(-MAX_LOG_ODDS))
+    return torch.where(
+        x < MAX_LOG_ODDS, value + slope * (x - MAX_LOG_ODDS), functional.softplus(x)
+    )
 
 
 def _sorted(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, Tensor]:
@@ -170,7 +172,9 @@ def _sorted(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, Tensor
             f"`{setting}`, got {others}; "
             "its ratio needs a third logit: use `objective=margin`"
         )
-    collapsed = torch.cat([largest(logits, group)[:, None], logits[:, ~group]], dim=1)
+    collapsed = torch.cat(
+        [compute_largest_logit(logits, group)[:, None], logits[:, ~group]], dim=1
+    )
     top = collapsed.topk(min(4, collapsed.shape[1]), dim=1).values
     return top, top[:, 0] - collapsed.amin(dim=1)
 

@@ -36,26 +36,26 @@ from advsearch.attacks.objective_functions import ReadFeatures
 from advsearch.attacks.objective_functions import margin as margin
 from advsearch.copies import copied
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.options import told
-from advsearch.registry import Registry, imported
+from advsearch.options import describe_value
+from advsearch.registry import Registry, load_attribute
 from advsearch.tasks import TASKS, Classification, Task
 from advsearch.tasks.classification import ClassTask
 from advsearch.tasks.detection import GOALS, Detection
-from advsearch.tasks.together import Together
+from advsearch.tasks.together import EnsembleTask
 
 # what a function may ask for by further parameters
-ASKED = ("u", "texture", "textures", "inputs", "configuration")
+REQUESTABLE_INPUTS = ("u", "texture", "textures", "inputs", "configuration")
 
-TRUTHS = ("target", "targets", "labels", "label", "truth")
+TRUTH_PARAMETERS = ("target", "targets", "labels", "label", "truth")
 """What the second of two parameters is called in a loss of outputs and right labels
 alone.
 """
 
 # what the second of two parameters is called in a function that forgot the third
-IMAGES = ("images", "image")
+IMAGE_PARAMETERS = ("images", "image")
 
-More = Callable[[str], Any]
-"""Gives what is asked for by one of the names in `ASKED`, at the configuration of each
+ReadInput = Callable[[str], Any]
+"""Gives what is asked for by one of the names in `REQUESTABLE_INPUTS`, at the configuration of each
 picture.
 """
 
@@ -66,13 +66,13 @@ class Objective(Protocol):
     """
 
     def __call__(
-        self, output: Any, images: Tensor, truth: Any, more: More = ..., /
+        self, output: Any, images: Tensor, truth: Any, more: ReadInput = ..., /
     ) -> Tensor:
         """Return (N,) values to maximise."""
         ...
 
 
-def nothing_more(name: str) -> Any:
+def reject_inputs(name: str) -> Any:
     """Refuse what is asked for where there is no configuration."""
     raise InputError(
         f"objective: asks for `{name}`, and no configuration was given; "
@@ -81,65 +81,65 @@ def nothing_more(name: str) -> Any:
 
 
 @dataclass(frozen=True)
-class Form:
+class ObjectiveSignature:
     """Which arguments a function takes: (output, images, truth), or without `images`,
-    and what it asks for beside them, of `ASKED`.
+    and what it asks for beside them, of `REQUESTABLE_INPUTS`.
     """
 
     images: bool = True
-    asked: tuple[str, ...] = ()
+    requested_inputs: tuple[str, ...] = ()
 
 
-def form_of(function: Callable[..., Any]) -> Form:
+def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
     """Return which arguments a function takes. The names of its first two parameters
     ask for nothing, nor does a third one in the place of the truth.
     """
     if isinstance(function, type):
         raise InputError(
             "objective: expected a name or a function (output, images, "
-            f"truth), got {told(function)}"
+            f"truth), got {describe_value(function)}"
         )
     try:
         signature = inspect.signature(
             function.forward if isinstance(function, nn.Module) else function
         )
     except ValueError:  # built in: nothing to look at
-        return Form()
+        return ObjectiveSignature()
     parameters = signature.parameters.values()
     by_position = [
         parameter.name for parameter in parameters if parameter.kind in (0, 1)
     ]
-    if by_position[:1] and by_position[0] in IMAGES:  # as a metric takes them
+    if by_position[:1] and by_position[0] in IMAGE_PARAMETERS:  # as a metric takes them
         raise InputError(
-            f"objective {name_of(function)!r}: its first argument is called "
+            f"objective {get_name(function)!r}: its first argument is called "
             f"{by_position[0]!r}, but gets what the "
             "model says; write (output, images, truth)"
         )
     asked = tuple(
         name
         for name in signature.parameters
-        if name in ASKED and name not in by_position[:2]
+        if name in REQUESTABLE_INPUTS and name not in by_position[:2]
     )
     unnamed = [name for name in by_position if name not in asked]
     images = len(unnamed) < 2 or any(
         parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters
     )
     images = images or (
-        unnamed[1] not in TRUTHS
-        and (len(unnamed) > 2 or unnamed[1] in (*IMAGES, *ASKED))
+        unnamed[1] not in TRUTH_PARAMETERS
+        and (len(unnamed) > 2 or unnamed[1] in (*IMAGE_PARAMETERS, *REQUESTABLE_INPUTS))
     )
     try:
         signature.bind(*([None] * (3 if images else 2)), **dict.fromkeys(asked))
     except TypeError as error:
         raise InputError(
-            f"objective {name_of(function)!r}: expected a function that takes (output, "
+            f"objective {get_name(function)!r}: expected a function that takes (output, "
             "images, truth) or (output, "
-            f"labels), and beside them any of {', '.join(ASKED)} by name: {error}"
+            f"labels), and beside them any of {', '.join(REQUESTABLE_INPUTS)} by name: {error}"
         ) from None
-    return Form(images, asked)
+    return ObjectiveSignature(images, asked)
 
 
-def checked(function: Callable[..., Tensor]) -> Objective:
+def wrap_objective(function: Callable[..., Tensor]) -> Objective:
     """Wrap a user's function: a scalar becomes (1,), and a wrong type, shape or a lost
     gradient is an InputError.
 
@@ -148,15 +148,15 @@ def checked(function: Callable[..., Tensor]) -> Objective:
     gets copies, which it may write into. What it raises itself passes through. NaN
     values pass too: a search has a rule for them.
     """
-    name = name_of(function)
-    form = form_of(function)
+    name = get_name(function)
+    form = read_signature(function)
 
     def objective(
-        output: Any, images: Tensor, truth: Any, more: More = nothing_more, /
+        output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
-        asked = {asks: more(asks) for asks in form.asked}
+        asked = {asks: more(asks) for asks in form.requested_inputs}
         count = images.shape[0]
-        arguments = (output, images, labels_of(truth, output, count))
+        arguments = (output, images, truth_to_labels(truth, output, count))
         handed = copied(arguments if form.images else arguments[::2])
         handed_by_name = copied(asked)
         try:
@@ -240,7 +240,7 @@ def _check_in_place(name: str, values: Tensor, read: Sequence[Tensor]) -> None:
         ) from None
 
 
-def name_of(function: Callable[..., Any]) -> str:
+def get_name(function: Callable[..., Any]) -> str:
     """Return what a function is called in messages."""
     return getattr(function, "__name__", type(function).__name__)
 
@@ -271,7 +271,7 @@ def _values(name: str, values: Any, count: int) -> Tensor:
     return by_picture
 
 
-def labels_of(truth: Any, output: Any, count: int) -> Any:
+def truth_to_labels(truth: Any, output: Any, count: int) -> Any:
     """Return the truth as a user's function gets it: a label set of one class as (N,)
     int64, anything else as it is.
     """
@@ -348,7 +348,7 @@ class ObjectiveKind:
 
 def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
     def plain(
-        output: Any, images: Tensor, truth: Any, more: More = nothing_more, /
+        output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
         return function(output, images, truth)
 
@@ -359,7 +359,7 @@ def _handed(objective: Objective) -> Objective:
     """The objective of another package, called with copies."""
 
     def handed(
-        output: Any, images: Tensor, truth: Any, more: More = nothing_more, /
+        output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
         return objective(
             *copied((output, images, truth)), lambda name: copied(more(name))
@@ -373,7 +373,7 @@ def _score_of(task: Task) -> Objective:
 
 
 _DEPTH_GOALS: Mapping[str, str] = (
-    imported("advsearch.tasks.depth:GOALS") if "depth" in TASKS.own else {}
+    load_attribute("advsearch.tasks.depth:GOALS") if "depth" in TASKS.built_ins else {}
 )
 _OWN = {
     kind.name: kind
@@ -443,11 +443,11 @@ _OWN = {
             for name, summary in GOALS.items()
         ),
         ObjectiveKind(
-            Together.objective,
+            EnsembleTask.objective,
             "of several tasks at once: each task's own objective, "
             "put together by `ensemble`",
             "those of the tasks",
-            task=Together.name,
+            task=EnsembleTask.name,
             of_task=_score_of,
         ),
         *(
@@ -471,7 +471,7 @@ _OWN = {
             ),
         ),
     )
-    if kind.task in (None, Together.name, *TASKS.own)
+    if kind.task in (None, EnsembleTask.name, *TASKS.built_ins)
 }
 
 OBJECTIVE_KINDS: Registry[ObjectiveKind] = Registry(
@@ -528,7 +528,7 @@ def get_objective(
     by_task = False
     ours = kind is not None and _OWN.get(kind.name) is kind
     if kind is None:
-        function = checked(objective)  # type: ignore[arg-type]
+        function = wrap_objective(objective)  # type: ignore[arg-type]
     elif kind.of_task is not None:
         return kind.of_task(task) if ours else _handed(kind.of_task(task))
     elif kind.of_features is not None:
@@ -543,15 +543,15 @@ def get_objective(
         function = function if ours else _handed(function)
     else:
         form = kind.form(targeted=targeted)
-        function = _plain(form) if ours else checked(form)
+        function = _plain(form) if ours else wrap_objective(form)
         compares_features = isinstance(task, Classification) and not task.reads_logits
         by_task = compares_features or (
-            isinstance(task, ClassTask) and bool(task.nothing)
+            isinstance(task, ClassTask) and bool(task.nothing_classes)
         )
     looks = kind is None and targeted
 
     def sought(
-        output: Any, images: Tensor, truth: Any, more: More = nothing_more, /
+        output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
         nonlocal looks
         wanted = task.target if targeted else truth
@@ -566,7 +566,7 @@ def get_objective(
             and output.requires_grad
         ):
             looks = False
-            _warn_of_direction(name_of(objective), value, output, wanted)  # type: ignore[arg-type]
+            _warn_of_direction(get_name(objective), value, output, wanted)  # type: ignore[arg-type]
         return -value if task.minimise else value
 
     return sought
@@ -629,7 +629,7 @@ def check_objective(
         )
     kind = _kind_of(objective)
     if kind is None:
-        form_of(objective)  # type: ignore[arg-type]
+        read_signature(objective)  # type: ignore[arg-type]
         return
     if not kind.fits(task):
         fitting = [name for name, other in OBJECTIVE_KINDS.items() if other.fits(task)]
@@ -647,13 +647,13 @@ def check_objective(
         )
 
 
-def asked_by(objective: str | Callable[..., Tensor]) -> tuple[str, ...]:
+def list_requested_inputs(objective: str | Callable[..., Tensor]) -> tuple[str, ...]:
     """Return what an objective, checked already, asks for beside output, images and
     truth.
     """
     kind = _kind_of(objective)
     function = objective if kind is None else kind.plain
-    return form_of(function).asked if callable(function) else ()
+    return read_signature(function).requested_inputs if callable(function) else ()
 
 
 def _kind_of(objective: object) -> ObjectiveKind | None:

@@ -17,10 +17,10 @@ from torch import Tensor
 from advsearch.attacks.candidates import (
     Candidate,
     Failures,
-    admit,
-    best,
-    contenders,
-    with_last,
+    add_candidate,
+    replace_worst,
+    select_best,
+    select_contenders,
 )
 from advsearch.attacks.domain import TOLERANCE, Distribution, Domain
 from advsearch.attacks.evaluation import (
@@ -31,9 +31,9 @@ from advsearch.attacks.evaluation import (
     Policy,
     Proposal,
     Query,
-    most_at_once,
+    max_batch_size,
 )
-from advsearch.attacks.policies.choices import with_choices
+from advsearch.attacks.policies.choices import wrap_choices
 from advsearch.attacks.verification import Ending
 from advsearch.copies import copied
 from advsearch.errors import InputError
@@ -64,7 +64,9 @@ class StepRecord:
     samples: int = 1  # as of `Proposal`
 
 
-Late = Callable[[int], bool]  # whether the time is over after so many evaluations
+IsOutOfTime = Callable[
+    [int], bool
+]  # whether the time is over after so many evaluations
 
 OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
 """Called after every evaluation, ranking included, with its record, u, and the (usable)
@@ -111,11 +113,11 @@ class SearchResult:
     failures: Failures | None = None
 
 
-def planned_renders(
-    steps: int, candidates: int = 4, repeats: int = 2, close: int = 0
+def count_planned_renders(
+    steps: int, candidates: int = 4, repeats: int = 2, max_extra_repeats: int = 0
 ) -> int:
     """Return how many pictures `search` renders at most with these arguments."""
-    return steps + candidates * (repeats + close)
+    return steps + candidates * (repeats + max_extra_repeats)
 
 
 def search(
@@ -127,12 +129,12 @@ def search(
     seed: int,
     candidates: int = 4,
     repeats: int = 2,
-    close: int = 0,
+    max_extra_repeats: int = 0,
     on_step: OnStep | None = None,
     seconds: float | None = None,
-    late: Late | None = None,
+    is_out_of_time: IsOutOfTime | None = None,
     kind: str = "search",
-    noise: int = 0,
+    render_seed: int = 0,
 ) -> SearchResult:
     """Run one policy on one domain and return the worst configuration it found.
 
@@ -147,7 +149,7 @@ def search(
        draw conditions (`Domain.drawn`), the raw best had easy ones, and the last
        configuration, to which all of them led, takes the place of the worst candidate.
        Those that are not clearly worse than the best by then are rendered again, up to
-       `close` times more (see `candidates.contenders`).
+       `max_extra_repeats` times more (see `candidates.contenders`).
 
     A policy that does not handle discrete choices is wrapped in `Choices` where the
     domain has some.
@@ -169,7 +171,7 @@ def search(
         seconds: end step 1 after the first evaluation that is done later than this,
             over 0; None for no limit. There is always one evaluation, and step 2 comes
             on top. Policies still plan for `steps`.
-        late: says, after so many evaluations, whether the time is over; in place of
+        is_out_of_time: says, after so many evaluations, whether the time is over; in place of
             `seconds`, for a run that goes on.
         kind: of the queries.
 
@@ -186,12 +188,12 @@ def search(
             "candidates and repeats: expected at least 0 and 1, got "
             f"{candidates} and {repeats}"
         )
-    if close < 0:
-        raise InputError(f"close: expected at least 0, got {close}")
+    if max_extra_repeats < 0:
+        raise InputError(f"close: expected at least 0, got {max_extra_repeats}")
     if seconds is not None and not seconds > 0.0:
         raise InputError(f"seconds: expected a number over 0, got {seconds}")
     started = time.perf_counter()
-    log = _Log(evaluate, domain, on_step, max(1, candidates), kind, noise)
+    log = _Log(evaluate, domain, on_step, max(1, candidates), kind, render_seed)
     try:
         with interruptible():
             deadline = math.inf if seconds is None else started + seconds
@@ -200,18 +202,18 @@ def search(
                 policy,
                 steps,
                 seed,
-                late or (lambda _: time.perf_counter() >= deadline),
+                is_out_of_time or (lambda _: time.perf_counter() >= deadline),
             )
-            if domain.drawn:
-                log.pool = with_last(log.pool, log.last, log.size)
+            if domain.draws_conditions:
+                log.pool = replace_worst(log.pool, log.last, log.size)
             if candidates:
-                _rank(log, steps, repeats, close)
+                _rank(log, steps, repeats, max_extra_repeats)
     except KeyboardInterrupt:
         stopped = Ending.INTERRUPTED
     best_candidate = (
-        best(log.pool) if log.pool else Candidate(domain.start, math.nan, False)
+        select_best(log.pool) if log.pool else Candidate(domain.start, math.nan, False)
     )
-    claimed = best_candidate.rate >= 0.5 and stopped is not Ending.INTERRUPTED
+    claimed = best_candidate.success_rate >= 0.5 and stopped is not Ending.INTERRUPTED
     final_policy = None
     state = None
     if log.state is not None:
@@ -221,11 +223,11 @@ def search(
             state = final_policy.update(state, log.evaluated_batch)
     return SearchResult(
         best_u=best_candidate.u,
-        best_objective=best_candidate.believed
-        if math.isfinite(best_candidate.believed)
+        best_objective=best_candidate.mean_objective
+        if math.isfinite(best_candidate.mean_objective)
         else math.nan,
         claimed_objective=best_candidate.objective,
-        success_rate=best_candidate.rate,
+        success_rate=best_candidate.success_rate,
         ending=Ending.FOUND if claimed else stopped,
         stopped=stopped,
         history=tuple(record for record in log.records if record.phase == "search"),
@@ -299,10 +301,10 @@ class _Log:
         ):
             seconds = time.perf_counter() - started
             _check_evaluation(raw, proposal, self.domain)
-            evaluation = raw.usable()
+            evaluation = raw.sanitize()
             self.gradients += bool(proposal.gradient)
             self.renders += raw.cost
-            if not evaluation.finite:
+            if not evaluation.is_finite:
                 self.non_finite += 1
             elif phase == "search":
                 self.best = (
@@ -313,14 +315,16 @@ class _Log:
                 candidate = Candidate(
                     proposal.u, evaluation.objective, evaluation.success
                 )
-                self.pool = admit(self.pool, candidate, self.size)
+                self.pool = add_candidate(self.pool, candidate, self.size)
                 self.last = candidate
             self.records.append(
                 StepRecord(
                     step=query.number,
                     seed=query.seed,
                     phase=phase,
-                    objective=evaluation.objective if evaluation.finite else math.nan,
+                    objective=evaluation.objective
+                    if evaluation.is_finite
+                    else math.nan,
                     best=self.best,
                     success=evaluation.success,
                     step_size=proposal.step_size,
@@ -351,17 +355,17 @@ class _Log:
 
 
 def _explore(
-    log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late
+    log: _Log, policy: Policy[Any], steps: int, seed: int, late: IsOutOfTime
 ) -> Ending:
     """Let the policy propose until the budget is spent or something ends it sooner;
     return what.
     """
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     name = policy.name
-    policy = log.policy = with_choices(policy, log.domain)
+    policy = log.policy = wrap_choices(policy, log.domain)
     state = policy.start(log.domain, generator, steps)
     n_non_finite = 0
-    max_batch = most_at_once(log.domain.dim)
+    max_batch = max_batch_size(log.domain.dim)
     while log.renders < steps:
         max_proposals = min(max_batch, steps - log.renders)
         proposals, state = policy.propose(state, max_proposals)
@@ -379,8 +383,8 @@ def _explore(
             if renders_left > 0:
                 # a policy may write into its own later
                 proposal_copy = replace(proposal, u=proposal.u.clone())
-                batch.append(proposal_copy.affordable(log.domain, renders_left))
-                renders_left -= batch[-1].cost(log.domain)
+                batch.append(proposal_copy.limit_cost(log.domain, renders_left))
+                renders_left -= batch[-1].max_cost(log.domain)
         log.state = state
         log.evaluated_batch = []
         is_out_of_time = False
@@ -388,7 +392,7 @@ def _explore(
         evaluations = log.evaluated(batch, range(first, first + len(batch)), "search")
         for proposal, evaluation in zip(batch, evaluations, strict=True):
             log.evaluated_batch.append((proposal.u, evaluation))
-            n_non_finite = 0 if evaluation.finite else n_non_finite + 1
+            n_non_finite = 0 if evaluation.is_finite else n_non_finite + 1
             if n_non_finite == NON_FINITE_LIMIT:
                 return Ending.NON_FINITE
             if is_out_of_time := late(len(log.records)):
@@ -410,7 +414,7 @@ def _rank(log: _Log, first: int, repeats: int, close: int) -> None:
         *(range(index, index + 1) for index in range(end, end + close)),
     ):
         if indices[0] >= end:
-            log.pool = contenders(log.pool, indices[0] - first)
+            log.pool = select_contenders(log.pool, indices[0] - first)
             if len(log.pool) < 2:
                 break
         pool = log.pool
@@ -418,7 +422,7 @@ def _rank(log: _Log, first: int, repeats: int, close: int) -> None:
         evaluations = log.evaluated(proposals, [*indices] * len(pool), "ranking")
         for position, candidate in enumerate(pool):
             for evaluation in islice(evaluations, len(indices)):
-                candidate = candidate.seen_again(
+                candidate = candidate.with_repeat(
                     evaluation.objective, evaluation.success
                 )
                 log.pool = (*log.pool[:position], candidate, *pool[position + 1 :])
@@ -456,7 +460,7 @@ def _check_evaluation(
     gradient = evaluation.gradient
     u = proposal.u
     min_cost = proposal.samples
-    max_cost = proposal.cost(domain)
+    max_cost = proposal.max_cost(domain)
     if proposal.gradient and gradient is None:
         raise RuntimeError("evaluate returned no gradient although one was asked for")
     if (

@@ -48,7 +48,7 @@ class Trials:
         return clopper_pearson(self.successes, self.trials, self.confidence)
 
 
-def trial_seed(seed: int, number: int) -> int:
+def derive_trial_seed(seed: int, number: int) -> int:
     """Return the seed of a trial, by its number: the same for all groups with that
     root.
     """
@@ -58,21 +58,26 @@ def trial_seed(seed: int, number: int) -> int:
 # sample counts to try; each quarters the variance of the one before
 LADDER = (4, 16, 64, 256)
 # renders of a configuration at each sample count after which one looks at them
-LOOKS = (4, 8)
+LOOK_SIZES = (4, 8)
 # renders of a sample count of which no more are made to look at, though there be more
 # trials
-MOST_LOOKED_AT = 20
+MAX_LOOK_SIZE = 20
 
 # (spp, seeds) -> margins in logits, one of each render
 MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]
 
 
-def margins_of(
-    evaluate: Evaluate, kind: str, u: Tensor, *, keep: int = 0, drawn: bool = False
+def make_margin_function(
+    evaluate: Evaluate,
+    kind: str,
+    u: Tensor,
+    *,
+    n_images: int = 0,
+    draws_conditions: bool = False,
 ) -> MarginsOf:
     """Return the margins of one configuration, its scores with their sign turned, under
-    the conditions that the scene comes with, or under those `drawn` by the seeds; the
-    rows of all sample counts are numbered together, and the first `keep` pictures of
+    the conditions that the scene comes with, or under those `draws_conditions` by the seeds; the
+    rows of all sample counts are numbered together, and the first `n_images` pictures of
     each are wanted.
     """
     n_made = Counter[int]()
@@ -82,10 +87,20 @@ def margins_of(
         rows = enumerate(zip(seeds, numbers, strict=True), n_made.total())
         n_made[spp] += len(seeds)
         queries = [
-            Query(u, seed, kind, row, spp=spp, drawn=drawn, keep=number < keep)
+            Query(
+                u,
+                seed,
+                kind,
+                row,
+                spp=spp,
+                draws_conditions=draws_conditions,
+                with_image=number < n_images,
+            )
             for row, (seed, number) in rows
         ]
-        return [-evaluation.said.score for evaluation in evaluate(queries)]
+        return [
+            -evaluation.required_judgement.score for evaluation in evaluate(queries)
+        ]
 
     return margins
 
@@ -103,7 +118,7 @@ class Rung:
     mean: float
     half_width: float
     drift: float
-    settled: bool
+    is_settled: bool
 
 
 @dataclass(frozen=True)
@@ -173,7 +188,7 @@ def choose_spp(
     table = list[Rung]()
     renders = 0
     reached = 1
-    looks = looks_of(trials)
+    looks = list_look_sizes(trials)
     for name, render in margins.items():
         values = _climbed(render, seed, ladder, looks, trials)
         below: list[float] = []
@@ -191,7 +206,7 @@ def choose_spp(
             below = margins_here
         renders = renders + sum(map(len, values))
         reached = max(reached, len(values) - 1)
-        if not table[-1].settled:
+        if not table[-1].is_settled:
             return SampleCount(ladder[-1], False, tuple(table), renders)
     return SampleCount(ladder[reached], True, tuple(table), renders)
 
@@ -291,9 +306,13 @@ def _may_settle(
     return error * _quantile(count, looks) / math.sqrt(count) <= max_mean
 
 
-def looks_of(trials: int = 0) -> tuple[int, ...]:
+def list_look_sizes(trials: int = 0) -> tuple[int, ...]:
     """Return after how many renders of a rung one looks, see `choose_spp`."""
-    return (*LOOKS, trials) if LOOKS[-1] < trials <= MOST_LOOKED_AT else LOOKS
+    return (
+        (*LOOK_SIZES, trials)
+        if LOOK_SIZES[-1] < trials <= MAX_LOOK_SIZE
+        else LOOK_SIZES
+    )
 
 
 def most_samples(
@@ -302,7 +321,11 @@ def most_samples(
     """Return the samples a pixel that `choose_spp` renders in all, at most: where only
     the last rung settles it.
     """
-    return configurations * looks_of(trials)[-1] * sum(ladder) if len(ladder) > 1 else 0
+    return (
+        configurations * list_look_sizes(trials)[-1] * sum(ladder)
+        if len(ladder) > 1
+        else 0
+    )
 
 
 def _deviation(values: Sequence[float]) -> float:
@@ -323,25 +346,29 @@ def _quantile(count: int, looks: int) -> float:
 # How many samples per pixel the rate of such trials needs (docs/design.md).
 
 # conditions under which each configuration is rendered at each sample count
-CONDITIONS = 30
-MOVED = 0.05  # share of the conditions that more samples may carry over zero
+N_CONDITIONS = 30
+MAX_MOVED_FRACTION = (
+    0.05  # share of the conditions that more samples may carry over zero
+)
 OVER_LADDER = LADDER[:3]  # sample counts to try
 # samples of a check over those of the searches, at most, beyond the second rung
-MOST_TIMES = 2
+MAX_SAMPLE_RATIO = 2
 
-Floats = npt.NDArray[np.float64]
+FloatArray = npt.NDArray[np.float64]
 
 
-def affordable(ladder: Sequence[int], pictures: int, searched: int) -> Sequence[int]:
+def limit_ladder(
+    ladder: Sequence[int], n_images: int, search_samples: int
+) -> Sequence[int]:
     """Return the sample counts of a ladder that a check can afford.
 
-    Its images take at most `MOST_TIMES` the samples of the searches; the first two
+    Its images take at most `MAX_SAMPLE_RATIO` the samples of the searches; the first two
     counts are returned in any case.
     """
     return [
         spp
         for index, spp in enumerate(ladder)
-        if index < 2 or pictures * spp <= MOST_TIMES * searched
+        if index < 2 or n_images * spp <= MAX_SAMPLE_RATIO * search_samples
     ]
 
 
@@ -352,10 +379,10 @@ def choose_rate_spp(
     conditions with a margin below zero where it is, of each configuration; return the
     highest rung that one of them needed.
 
-    Each is rendered under the same `CONDITIONS` at a rung and at the one below. It has
+    Each is rendered under the same `N_CONDITIONS` at a rung and at the one below. It has
     settled where the mean change of the margin, taken once more and at either end of
-    its 95 % interval (Student's t), would carry at most `MOVED` of the conditions over
-    zero (`moved`). The error that is left falls with the sample count, so it is smaller
+    its 95 % interval (Student's t), would carry at most `MAX_MOVED_FRACTION` of the conditions over
+    zero (`estimate_moved_fraction`). The error that is left falls with the sample count, so it is smaller
     than the change that led here (`benchmarks/verdicts.py` has how far the rate is off
     then). No render of it is a trial. Arguments are as of `choose_spp`; conditions are
     drawn by the seeds.
@@ -364,9 +391,9 @@ def choose_rate_spp(
         return SampleCount(ladder[0], False, (), 0)
     table = list[Rung]()
     reached = 1
-    seeds = [stream(seed, "sample count", number) for number in range(CONDITIONS)]
+    seeds = [stream(seed, "sample count", number) for number in range(N_CONDITIONS)]
     for name, render in margins.items():
-        margins_below: Floats | None = None
+        margins_below: FloatArray | None = None
         for index, spp in enumerate(ladder):
             margins_at_rung = np.array(render(spp, seeds), dtype=np.float64)
             half_width = (
@@ -381,7 +408,8 @@ def choose_rate_spp(
             )
             settled = (
                 margins_below is not None
-                and moved(margins_at_rung, margins_below) <= MOVED
+                and estimate_moved_fraction(margins_at_rung, margins_below)
+                <= MAX_MOVED_FRACTION
             )
             table.append(
                 Rung(
@@ -398,11 +426,13 @@ def choose_rate_spp(
                 break
             margins_below = margins_at_rung
         else:
-            return SampleCount(ladder[-1], False, tuple(table), CONDITIONS * len(table))
-    return SampleCount(ladder[reached], True, tuple(table), CONDITIONS * len(table))
+            return SampleCount(
+                ladder[-1], False, tuple(table), N_CONDITIONS * len(table)
+            )
+    return SampleCount(ladder[reached], True, tuple(table), N_CONDITIONS * len(table))
 
 
-def moved(here: Floats, below: Floats) -> float:
+def estimate_moved_fraction(here: FloatArray, below: FloatArray) -> float:
     """Return the fraction of conditions that more samples may carry over zero.
 
     The mean change of the margins (n,) from one rung to the next is taken once more.

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluate, Query
-from advsearch.attacks.trials import Trials, trial_seed
+from advsearch.attacks.trials import Trials, derive_trial_seed
 from advsearch.errors import InputError
 from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
 from advsearch.tasks import Judgement
@@ -94,7 +94,7 @@ rate in 95 % of all cases (`benchmarks/verdicts.py`): somebody who looks five ti
 lucky more often than somebody who looks once.
 """
 
-LEAST_RATE = 0.5
+MIN_RATE = 0.5
 """Where the 95 % interval of a claim's rate may begin: what is called found holds more
 often than not. So 6 trials are the fewest that can verify anything (54 to 100 %); 5 of
 5 begin at 48 %.
@@ -106,84 +106,90 @@ class Rule:
     """When a claim counts as verified."""
 
     percent: int = PASS_PERCENT  # of the trials in which it must hold
-    control: bool = True
+    has_control: bool = True
     """A success counts only where the clean configuration is right, which it has to be
     in as many per cent.
     """
-    conditional: bool = False
+    is_conditional: bool = False
     """The percentage is one of the trials in which the clean configuration is right,
     and it has to be right in half of all: for conditions that vary, and may be hard
     ones by themselves.
     """
 
-    def needed(self, trials: int, *, early: bool = False) -> int:
+    def count_needed(self, trials: int, *, early: bool = False) -> int:
         """Return how many of `trials` must succeed: the percentage, rounded up, and
         never under `fewest`. Of conditions, `early` asks for those of `OVER_EARLY`:
         more of them could follow.
         """
         return max(
-            OVER_EARLY[trials] if early and self.conditional else self.share(trials),
-            self.fewest,
+            OVER_EARLY[trials]
+            if early and self.is_conditional
+            else self.count_percent(trials),
+            self.min_trials,
         )
 
-    def allowed(self, trials: int) -> int:
-        return trials - self.needed(trials)
+    def count_allowed_failures(self, trials: int) -> int:
+        return trials - self.count_needed(trials)
 
     @property
-    def fewest(self) -> int:
+    def min_trials(self) -> int:
         """Trials under which nothing is verified: even without a failure their interval
-        begins under `LEAST_RATE`.
+        begins under `MIN_RATE`.
         """
         return next(
             n
             for n in itertools.count(1)
-            if clopper_pearson(self.share(n), n)[0] >= LEAST_RATE
+            if clopper_pearson(self.count_percent(n), n)[0] >= MIN_RATE
         )
 
-    def share(self, trials: int) -> int:
+    def count_percent(self, trials: int) -> int:
         return -(-self.percent * trials // 100)
 
-    def succeeded(self, trial: Judgement, clean: Judgement) -> bool:
+    def is_success(self, trial: Judgement, clean: Judgement) -> bool:
         """Whether a trial counts beside that of the clean configuration with the same
         seed: which has to be right, so that what the noise does by itself does not
         count; where it may be wrong, the trial has the larger score.
         """
         return trial.success and (
-            clean.right if self.control else trial.score > clean.score
+            clean.right if self.has_control else trial.score > clean.score
         )
 
-    def counted(self, clean: Sequence[Judgement]) -> int:
+    def count_valid(self, clean: Sequence[Judgement]) -> int:
         """Return how many trials count, beside these of the clean configuration."""
-        return sum(trial.right for trial in clean) if self.conditional else len(clean)
+        return (
+            sum(trial.right for trial in clean) if self.is_conditional else len(clean)
+        )
 
-    def already_wrong(self, clean: Trials) -> bool:
+    def is_already_wrong(self, clean: Trials) -> bool:
         """Whether a clean configuration is no start at all: right in less than half of
         its trials.
         """
-        return self.control and 2 * clean.successes < clean.trials
+        return self.has_control and 2 * clean.successes < clean.trials
 
-    def decided(self, successes: int, trials: int) -> bool | None:
+    def decide(self, successes: int, trials: int) -> bool | None:
         """Return what so many trials of one configuration say: success, none, or None
         where it depends on the noise.
         """
-        if min(successes, trials - successes) > self.allowed(trials):
+        if min(successes, trials - successes) > self.count_allowed_failures(trials):
             return None
-        return successes >= self.needed(trials)
+        return successes >= self.count_needed(trials)
 
-    def verdict(self, search: Ending, clean: Trials, adversarial: Trials) -> Ending:
+    def decide_ending(
+        self, search: Ending, clean: Trials, adversarial: Trials
+    ) -> Ending:
         """Return the run's ending from the search's ending and the trials of both
         groups: FOUND if both reach what the rule needs, whatever the search itself
         believed.
         """
         if search is Ending.INTERRUPTED:
             return search
-        if self.already_wrong(clean):
+        if self.is_already_wrong(clean):
             return Ending.ALREADY_WRONG
-        enough = adversarial.successes >= self.needed(adversarial.trials)
+        enough = adversarial.successes >= self.count_needed(adversarial.trials)
         control = (
-            not self.control
-            or self.conditional
-            or clean.successes >= self.needed(clean.trials)
+            not self.has_control
+            or self.is_conditional
+            or clean.successes >= self.count_needed(clean.trials)
         )
         if control and enough:
             return Ending.FOUND
@@ -191,8 +197,8 @@ class Rule:
 
 
 WORST_CASE = Rule()
-OVER_CONDITIONS = Rule(PASS_PERCENT_OVER, conditional=True)
-EASIER = Rule(control=False)
+OVER_CONDITIONS = Rule(PASS_PERCENT_OVER, is_conditional=True)
+EASIER = Rule(has_control=False)
 """For `--minimise`: the clean configuration may be wrong, so there is no control group
 to pass; but a success has to be recognised better than the clean one with the same
 seed.
@@ -206,8 +212,8 @@ class Verification:
     ending: Ending  # the run's; FOUND only if `Rule.verdict` says so
     reason: str  # one sentence with the numbers behind it
     u: Tensor  # (d,) the configuration verified, projected into its budget again
-    clean: Trials  # right predictions of the control group
-    adversarial: Trials  # successes, by `Rule.succeeded`
+    clean_counts: Trials  # right predictions of the control group
+    adversarial_counts: Trials  # successes, by `Rule.succeeded`
     # every single trial, in the order of their seeds
     clean_trials: tuple[Judgement, ...]
     # likewise; of curtailed ones this group is the shorter
@@ -220,10 +226,10 @@ class Verification:
     """Of each trial of the second group, whether it is a success; None where it does
     not count, as under its conditions the clean configuration is wrong.
     """
-    begin: int = 0  # the number of the first trial
+    first_index: int = 0  # the number of the first trial
 
     @property
-    def counting(self) -> tuple[Judgement, ...]:
+    def valid_trials(self) -> tuple[Judgement, ...]:
         trials = zip(self.adversarial_trials, self.outcomes, strict=True)
         return (
             tuple(trial for trial, outcome in trials if outcome is not None)
@@ -231,7 +237,7 @@ class Verification:
         )
 
     @property
-    def successes(self) -> tuple[Judgement, ...]:
+    def successful_trials(self) -> tuple[Judgement, ...]:
         return tuple(itertools.compress(self.adversarial_trials, self.outcomes))
 
 
@@ -242,11 +248,11 @@ def run_trials(
     spp: int,
     seed: int,
     trials: int = 20,
-    first: int = 0,
-    begin: int = 0,
+    n_done: int = 0,
+    first_index: int = 0,
     kind: str = "verification",
-    keep: int = 0,
-    until: Callable[[Sequence[Judgement]], bool] | None = None,
+    n_images: int = 0,
+    is_decided: Callable[[Sequence[Judgement]], bool] | None = None,
 ) -> tuple[Judgement, ...]:
     """Render and judge one configuration (d,) `trials` times, trial k with seed k of
     the stream "verification" of the root `seed`: two groups of one root get the same
@@ -256,11 +262,11 @@ def run_trials(
         evaluate: answers the queries; see `Query`.
         spp, trials: samples a pixel, and how many trials there are then; under 1 they
             are an InputError.
-        first: how many of them there are already, which are left out.
-        begin: the number of the first of all.
+        n_done: how many of them there are already, which are left out.
+        first_index: the number of the first of all.
         kind: of their rows.
-        keep: the pictures of the first so many are wanted.
-        until: asked after every trial, ends them sooner.
+        n_images: the pictures of the first so many are wanted.
+        is_decided: asked after every trial, ends them sooner.
     """
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")
@@ -270,17 +276,17 @@ def run_trials(
     queries = [
         Query(
             u,
-            trial_seed(seed, number),
+            derive_trial_seed(seed, number),
             kind,
             number,
             spp=spp,
-            keep=number < begin + keep,
+            with_image=number < first_index + n_images,
         )
-        for number in range(begin + first, begin + trials)
+        for number in range(first_index + n_done, first_index + trials)
     ]
     for evaluation in evaluate(queries):
-        done.append(evaluation.said)
-        if until is not None and until(done):
+        done.append(evaluation.required_judgement)
+        if is_decided is not None and is_decided(done):
             return tuple(done)
     if len(done) != len(queries):
         raise RuntimeError(f"evaluate answered {len(done)} of {len(queries)} queries")
@@ -304,10 +310,10 @@ def verify(
     clean: Sequence[Judgement] = (),
     rule: Rule = WORST_CASE,
     kind: str = "verification",
-    control: str = "control",
-    keep: int = 0,
+    control_kind: str = "control",
+    n_images: int = 0,
     curtailed: bool = False,
-    begin: int = 0,
+    first_index: int = 0,
 ) -> Verification:
     """Check what a search found in fresh trials against the clean configuration as
     control group.
@@ -344,7 +350,7 @@ def verify(
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
     has_several_looks = len(looks) > 1
-    min_trials = rule.fewest if has_several_looks and not curtailed else 0
+    min_trials = rule.min_trials if has_several_looks and not curtailed else 0
     u = domain.project(u)
     clean_trials = list(clean)
     done = list[Judgement]()
@@ -352,27 +358,33 @@ def verify(
     def has_failed(new_trials: Sequence[Judgement]) -> bool:
         """Whether too many trials fail for any look."""
         tried = [*done, *new_trials]
-        n_total = looks[-1] if has_several_looks else rule.counted(clean_trials)
+        n_total = looks[-1] if has_several_looks else rule.count_valid(clean_trials)
         n_failures = _list_outcomes(rule, tried, clean_trials).count(False)
-        return len(tried) >= min_trials and n_failures > rule.allowed(n_total)
+        return len(tried) >= min_trials and n_failures > rule.count_allowed_failures(
+            n_total
+        )
 
-    run = partial(run_trials, evaluate, spp=spp, seed=seed, begin=begin)
-    run_clean = partial(run, domain.start, kind=control)
+    run = partial(run_trials, evaluate, spp=spp, seed=seed, first_index=first_index)
+    run_clean = partial(run, domain.start, kind=control_kind)
     until = has_failed if curtailed or has_several_looks else None
     for look in looks:
         # Under conditions, clean trials that are wrong do not count: more are run.
         count = look
         clean_trials += run_clean(trials=count, first=len(clean_trials))
-        n_missing = look - rule.counted(clean_trials[:count])
+        n_missing = look - rule.count_valid(clean_trials[:count])
         while n_missing > 0 and count < looks[-1]:
             count = min(count + n_missing, looks[-1])
             clean_trials += run_clean(trials=count, first=len(clean_trials))
-            n_missing = look - rule.counted(clean_trials[:count])
-        done += run(u, trials=count, first=len(done), kind=kind, keep=keep, until=until)
+            n_missing = look - rule.count_valid(clean_trials[:count])
+        done += run(
+            u, trials=count, first=len(done), kind=kind, keep=n_images, until=until
+        )
         is_early = count < looks[-1]
-        n_needed = rule.needed(rule.counted(clean_trials[:count]), early=is_early)
+        n_needed = rule.count_needed(
+            rule.count_valid(clean_trials[:count]), early=is_early
+        )
         n_successes = _list_outcomes(rule, done, clean_trials).count(True)
-        is_clean_wrong = rule.already_wrong(count_right(clean_trials[:count], spp))
+        is_clean_wrong = rule.is_already_wrong(count_right(clean_trials[:count], spp))
         is_success = n_successes >= n_needed and not is_clean_wrong
         if len(done) < count or has_failed(()) or is_success or not is_early:
             break
@@ -385,12 +397,12 @@ def verify(
         done,
         spp=spp,
         confidence=(
-            OVER_CONFIDENCE if rule.conditional and has_several_looks else CONFIDENCE
+            OVER_CONFIDENCE if rule.is_conditional and has_several_looks else CONFIDENCE
         ),
         renders=len(done) + len(clean_trials) - len(clean),
         stopped="asked for" if was_asked_for else "decided",
         is_early=is_success and is_early,
-        begin=begin,
+        begin=first_index,
     )
 
 
@@ -403,10 +415,10 @@ def _list_outcomes(
     """
     outcomes: list[bool | None] = []
     for trial, clean in zip(trials, clean_trials, strict=False):
-        if rule.conditional and not clean.right:
+        if rule.is_conditional and not clean.right:
             outcomes.append(None)
         else:
-            outcomes.append(rule.succeeded(trial, clean))
+            outcomes.append(rule.is_success(trial, clean))
     return tuple(outcomes)
 
 
@@ -432,10 +444,10 @@ def _summarize_trials(
     n_counted = max(1, len(outcomes) - outcomes.count(None))
     clean_counts = count_right(clean_trials, spp)
     counts = Trials(outcomes.count(True), n_counted, spp, confidence)
-    ending = rule.verdict(claim, clean_counts, counts)
+    ending = rule.decide_ending(claim, clean_counts, counts)
     reason = (
         f"{ending.explanation} A success in {counts.successes} of {n_counted} trials, "
-        f"{rule.needed(n_counted, early=is_early)} are needed; clean right in "
+        f"{rule.count_needed(n_counted, early=is_early)} are needed; clean right in "
         f"{clean_counts.successes} of {clean_counts.trials}."
     )
     return Verification(

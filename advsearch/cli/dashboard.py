@@ -13,9 +13,9 @@ from advsearch.cli import output
 from advsearch.cli.main import argument, command
 from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
-from advsearch.registry import imported
+from advsearch.registry import load_attribute
 from advsearch.runs.directory import find_run
-from advsearch.viewer.clients import NO_QR, qr_text
+from advsearch.viewer.clients import NO_QR, format_qr_code
 from advsearch.viewer.pages import write_page
 from advsearch.viewer.server import Dashboard
 
@@ -71,7 +71,7 @@ def dashboard(args: argparse.Namespace) -> int:
     # the list says what is wrong with one
     runs = [find_run(name, checked=False) for name in args.runs]
     has_photographs = is_present(PHOTOGRAPH_PAGES.partition(":")[0])
-    photographs = imported(PHOTOGRAPH_PAGES)() if has_photographs else None
+    photographs = load_attribute(PHOTOGRAPH_PAGES)() if has_photographs else None
     server = Dashboard(
         runs, args.host, args.port, https=args.https, photographs=photographs
     )
@@ -92,7 +92,8 @@ def dashboard(args: argparse.Namespace) -> int:
     if server.token:
         print(SEEN, file=sys.stderr)
         print(
-            qr_text(server.address) or f"For a code to point a phone at: {NO_QR}",
+            format_qr_code(server.address)
+            or f"For a code to point a phone at: {NO_QR}",
             file=sys.stderr,
         )
     print("Ctrl-C ends it.", file=sys.stderr)

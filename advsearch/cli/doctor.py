@@ -271,24 +271,28 @@ def _reinstall(name: str) -> str:
 
 def check_llvm() -> Component:
     """The libLLVM that will be used, what else there is, and why that is not used."""
-    given = os.environ.get(llvm.VARIABLE, "")
-    others = llvm.find()
+    given = os.environ.get(llvm.ENVIRONMENT_VARIABLE, "")
+    others = llvm.find_libraries()
     try:
         chosen = llvm.ensure_llvm()
     except AdvsearchError as error:
         fix = (
-            f"unset {llvm.VARIABLE}"
+            f"unset {llvm.ENVIRONMENT_VARIABLE}"
             if given
-            else (f"{llvm.install_command()} (or name a file in {llvm.VARIABLE})")
+            else (
+                f"{llvm.get_install_command()} (or name a file in {llvm.ENVIRONMENT_VARIABLE})"
+            )
         )
         return Component(
             "libLLVM", "", BROKEN if others or given else MISSING, str(error), fix
         )
-    refused = [str(c) for c in others if c.refused]
+    refused = [str(c) for c in others if c.refusal]
     usable = [
-        str(c) for c in others if not c.refused and c.path != chosen.path.resolve()
+        str(c) for c in others if not c.refusal and c.path != chosen.path.resolve()
     ]
-    detail = f"chosen: {chosen.path}" + (f", named by {llvm.VARIABLE}" if given else "")
+    detail = f"chosen: {chosen.path}" + (
+        f", named by {llvm.ENVIRONMENT_VARIABLE}" if given else ""
+    )
     detail += f"; also usable: {', '.join(usable)}" if usable else ""
     detail += f"; refused: {', '.join(refused)}" if refused else ""
     return Component("libLLVM", ".".join(map(str, chosen.version)), OK, detail)

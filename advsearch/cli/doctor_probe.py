@@ -32,9 +32,9 @@ def probe_renderer() -> str:
     colour, which is linear.
     """
     # what is probed
-    from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba
+    from advsearch.scene.mitsuba_backend.variant import VARIANT, import_mitsuba
 
-    mi = mitsuba()
+    mi = import_mitsuba()
     import drjit as dr  # what is probed
 
     wall = {

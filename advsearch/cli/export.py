@@ -66,7 +66,7 @@ def _begin_lower(sentence: str) -> str:
     examples=(
         "export mug-texture-001",
         "export runs/mug-texture-001 --kind search --out search.parquet",
-        *(EXPORTERS[name].example for name in EXPORTERS.own),
+        *(EXPORTERS[name].example for name in EXPORTERS.built_ins),
     ),
 )  # fmt: skip
 def export(args: argparse.Namespace) -> int:

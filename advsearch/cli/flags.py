@@ -113,17 +113,17 @@ def config_of_file(
 
 def _inside(scene: str) -> str:
     # late: another thing has this name here
-    from advsearch.scene.importing.files import shown
+    from advsearch.scene.importing.files import format_name
 
     # late, so that --help answers at once
-    from advsearch.scene.importing.scenes import MITSUBA_FILE, node_names
-    from advsearch.scene.mitsuba_backend.scene_files import contents
+    from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, list_node_names
+    from advsearch.scene.mitsuba_backend.scene_files import read_contents
 
     path = Path(scene)
     names = (
-        contents(path).objects
-        if path.suffix.lower() == MITSUBA_FILE
-        else node_names(path)
+        read_contents(path).objects
+        if path.suffix.lower() == MITSUBA_SUFFIX
+        else list_node_names(path)
     )
     if not names:
         raise InputError(
@@ -131,7 +131,9 @@ def _inside(scene: str) -> str:
             "expected a shape or a node with a mesh"
         )
     more = f" or {len(names) - MOST_NAMES:,} more" if len(names) > MOST_NAMES else ""
-    return ", ".join(shown(name, quoted=False) for name in names[:MOST_NAMES]) + more
+    return (
+        ", ".join(format_name(name, quoted=False) for name in names[:MOST_NAMES]) + more
+    )
 
 
 def with_flags(message: str) -> str:

@@ -51,9 +51,9 @@ def file(args: argparse.Namespace) -> int:
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with at_work(as_json=True, quiet=False):
         # late: another thing has this name here
-        from advsearch.scene.importing.scenes import MITSUBA_FILE, contents
+        from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, contents
 
-        if Path(args.file).suffix.lower() == MITSUBA_FILE:
+        if Path(args.file).suffix.lower() == MITSUBA_SUFFIX:
             facts, lines = _mitsuba_file(args.file, out)
         else:
             inside = contents(Path(args.file))
@@ -104,7 +104,7 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
         "nodes": [
             {
                 "name": n.name,
-                "mesh": n.mesh,
+                "mesh": n.mesh_name,
                 "triangles": n.triangles,
                 "size": list(n.size),
             }
@@ -123,7 +123,7 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
     if nodes:
         sizes = [" x ".join(f"{side:.3g}" for side in node.size) for node in nodes]
         rows = [
-            [n.name, n.mesh, f"{n.triangles:,} triangles", size]
+            [n.name, n.mesh_name, f"{n.triangles:,} triangles", size]
             for n, size in zip(nodes, sizes, strict=True)
         ]
         lines.append(output.aligned([["node", "in controls", "", "size"], *rows]))
@@ -149,9 +149,9 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
 
 def _mitsuba_file(file: str, out: Path | None) -> Understood:
     # late: another thing has this name here
-    from advsearch.scene.mitsuba_backend.scene_files import contents
+    from advsearch.scene.mitsuba_backend.scene_files import read_contents
 
-    inside = contents(Path(file))
+    inside = read_contents(Path(file))
     warnings: tuple[str, ...] = ()
     if inside.objects:
         plain = next(
@@ -167,7 +167,7 @@ def _mitsuba_file(file: str, out: Path | None) -> Understood:
             f"{file}: no shape of it can be the object, so that it cannot "
             "be pictured; leave --out out"
         )
-    kept = dict(inside.kept)
+    kept = dict(inside.unchanged)
     listed = {
         "objects": list(inside.objects),
         "kept": [f"{name} ({why})" for name, why in kept.items()],

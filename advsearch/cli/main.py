@@ -42,7 +42,7 @@ from advsearch.registry import (
     EXPERIMENTS,
     get_experiment,
     get_experiment_help,
-    imported,
+    load_attribute,
 )
 from advsearch.trust.code import allow_code, nothing_allowed
 from advsearch.version import __version__
@@ -120,7 +120,7 @@ class ExperimentCommand:
             parser.add_argument(
                 about,
                 metavar=positional.metavar,
-                nargs="*" if positional.many else "?",
+                nargs="*" if positional.is_repeatable else "?",
                 default=argparse.SUPPRESS,
                 help=f"as `--{about}`{positional.more}",
             )
@@ -134,7 +134,7 @@ class ExperimentCommand:
         about = self.experiment.about
         subject = getattr(args, about, None)
         if self.experiment.choices and subject == "list":
-            lines = imported(self.experiment.choices)()
+            lines = load_attribute(self.experiment.choices)()
             listed = [{"name": name, "title": text} for name, text in lines.items()]
             return output.say(
                 args.json, {f"{self.name}s": listed}, output.aligned([*lines.items()])
@@ -166,7 +166,7 @@ class ExperimentCommand:
             return config_from(args, config_type)
         if about in args:
             run_name = getattr(args, about)
-            if self.experiment.positional and self.experiment.positional.many:
+            if self.experiment.positional and self.experiment.positional.is_repeatable:
                 run_name = next(iter(split_names(run_name)), run_name)
             return config_from(
                 args,
@@ -292,7 +292,7 @@ def get_command(name: str) -> ExperimentCommand | PlainCommand:
     target = COMMANDS_OF_THIS_PACKAGE.get(name)
     if target is None:
         return ExperimentCommand(get_experiment(name))
-    command: PlainCommand = imported(f"advsearch.cli.{target.partition(' ')[0]}")
+    command: PlainCommand = load_attribute(f"advsearch.cli.{target.partition(' ')[0]}")
     return command
 
 
@@ -491,7 +491,7 @@ def add_command(
 
 def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputError:
     # late, so that --help answers at once
-    from advsearch.calls import meant_by
+    from advsearch.calls import suggest_keyword
     from advsearch.config import CONFIGS
     from advsearch.settings import settings
 
@@ -514,7 +514,9 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
             f"{parser.prog} has no {name}, a flag of advsearch "
             f"{', '.join(owners)}; leave it out"
         )
-    meant, reason = meant_by(name[2:].replace("-", "_"), [flag[2:] for flag in known])
+    meant, reason = suggest_keyword(
+        name[2:].replace("-", "_"), [flag[2:] for flag in known]
+    )
     if meant or reason:
         hint = (
             f"; did you mean {' or '.join(f'--{flag}' for flag in meant)}?"

@@ -230,12 +230,12 @@ def go_on_command(run: str | Path) -> str:
         config = config_of_file(command_in(file), file, {})
         metrics = getattr(config, "metrics", {}).values()
         if isinstance(config, SceneConfig) and ":" in "".join(
-            [config.model, *config.kinds_of_controls, *metrics]
+            [config.model, *config.control_kinds, *metrics]
         ):
-            from advsearch.engine.naming import code_of  # takes seconds
+            from advsearch.engine.naming import list_imported_code  # takes seconds
 
-            names = code_of(
-                split_names(config.model), config.kinds_of_controls, metrics
+            names = list_imported_code(
+                split_names(config.model), config.control_kinds, metrics
             )
             words += [word for name in names for word in ("--code", name)]
     return shlex.join(words)

@@ -76,8 +76,8 @@ LARGEST_POSES = 1 << 20
 def report(args: argparse.Namespace) -> int:
     # late, so that --help answers at once
     from advsearch.extend import directory, writing
-    from advsearch.questions.report.evidence import collected, read_exposure
-    from advsearch.questions.report.result import evidence_page, markdown
+    from advsearch.questions.report.evidence import collect_evidence, read_exposure
+    from advsearch.questions.report.result import format_markdown, make_evidence_page
 
     if not args.evidence:
         raise InputError(
@@ -101,7 +101,7 @@ def report(args: argparse.Namespace) -> int:
     exposure = {} if args.exposure is None else read_exposure(args.exposure)
     if args.photographs is not None:
         _take_in(args.photographs, args.runs[0])
-    evidence, pictures = collected(
+    evidence, pictures = collect_evidence(
         args.runs, criterion=args.criterion, exposure=exposure, by=args.by
     )
     try:
@@ -113,8 +113,8 @@ def report(args: argparse.Namespace) -> int:
     for name, data in pictures.items():
         writing.write_bytes(folder / name, data)
     texts = (
-        evidence_page(evidence, pictures),
-        markdown(evidence),
+        make_evidence_page(evidence, pictures),
+        format_markdown(evidence),
         directory.summary.to_json(evidence) + "\n",
     )
     for path, text in zip(names, texts, strict=True):

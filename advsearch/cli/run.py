@@ -19,7 +19,7 @@ from advsearch.registry import get_experiment
 from advsearch.runs.directory import CONFIG, HOME, REPORT, find_run, read_python_only
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.settings import parse_assignment
-from advsearch.settings.values import put
+from advsearch.settings.values import set_dotted
 from advsearch.trust.code import allow_named
 from advsearch.viewer.pages import write_page
 
@@ -59,7 +59,7 @@ def changes_in(words: Sequence[str]) -> dict[str, object]:
     changes = dict(parse_assignment(text, f"change {text!r}") for text in words)
     typed = dict[str, object]()
     for name, value in changes.items():
-        put(typed, name, value)
+        set_dotted(typed, name, value)
     allow_named(typed)
     return changes
 

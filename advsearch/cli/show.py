@@ -21,13 +21,13 @@ from advsearch.cli.main import argument, command
 from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
-from advsearch.options import declared_options, default_of, type_of
+from advsearch.options import get_option_default, get_option_type, list_declared_options
 from advsearch.registry import (
     EXPERIMENTS,
     Registry,
     get_experiment,
     get_first_doc_line,
-    imported,
+    load_attribute,
 )
 from advsearch.report.wording import count, interval_text
 from advsearch.runs.directory import IMAGES, PHOTOGRAPHS, find_run
@@ -75,7 +75,7 @@ def show(args: argparse.Namespace) -> int:
         case [command, name] if command in EXPERIMENTS and (
             target := get_experiment(command).choice_description
         ):
-            text, facts = imported(target)(name)
+            text, facts = load_attribute(target)(name)
             return output.say(args.json, {command: name, **facts}, text)
         case [name]:
             try:
@@ -193,10 +193,12 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
             )
     else:
         options = list[dict[str, Any]]()
-        for option, field in declared_options(entry).items():
-            default = default_of(field)
+        for option, field in list_declared_options(entry).items():
+            default = get_option_default(field)
             default = plain(getattr(default, "name", default))
-            options.append({"name": option, "type": type_of(field), "default": default})
+            options.append(
+                {"name": option, "type": get_option_type(field), "default": default}
+            )
         facts["options"], rows = (
             options,
             [{**option, "default": _cell(option["default"])} for option in options],
@@ -367,7 +369,7 @@ def list_names(kind: str) -> dict[str, str]:
 
 
 def _registry(kind: str) -> Any:
-    registry = imported(REGISTRIES[kind])
+    registry = load_attribute(REGISTRIES[kind])
     return registry() if callable(registry) else registry
 
 
@@ -423,7 +425,7 @@ def labels(args: argparse.Namespace) -> int:
     with at_work(as_json=True, quiet=False):
         # late, so that --help answers at once
         from advsearch.models import load_model, read_labels
-        from advsearch.models.labels import matching_labels, names_nothing
+        from advsearch.models.labels import find_similar_labels, is_nothing_name
 
         if "labels" in args and args.labels is not None:
             names = read_labels(args.labels)
@@ -438,13 +440,13 @@ def labels(args: argparse.Namespace) -> int:
         like = (
             range(len(names))
             if args.word is None
-            else [index for index, _ in matching_labels(args.word, names)]
+            else [index for index, _ in find_similar_labels(args.word, names)]
         )
-        asked = args.word is not None and names_nothing(args.word)
+        asked = args.word is not None and is_nothing_name(args.word)
         classes = {
             index: names[index]
             for index in like
-            if asked or not names_nothing(names[index])
+            if asked or not is_nothing_name(names[index])
         }
     if not classes:
         raise InputError(

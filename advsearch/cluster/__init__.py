@@ -19,17 +19,17 @@ from advsearch.files import JsonObject
 from advsearch.trust.code import allowed_code
 
 # a pure function of a batch that computes its result
-Call = Callable[[Sequence[Any]], Any]
+BatchFunction = Callable[[Sequence[Any]], Any]
 
 # workers that may die of a call before it is given up
-DEATHS = 3
+MAX_DEATHS = 3
 
 
 @dataclass(frozen=True)
 class WorkerTask:
     """How workers compute batches, in a form that can be sent to them."""
 
-    # "package.module:function", which takes the settings and returns a `Call`
+    # "package.module:function", which takes the settings and returns a `BatchFunction`
     function: str
     settings: JsonObject
     # settings that may hold paths, separated by commas, whose files are sent along
@@ -85,7 +85,7 @@ class WorkerStats:
     machines: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
-    def told(self) -> dict[str, float | str]:
+    def progress_counts(self) -> dict[str, float | str]:
         """Counts to show next to a progress bar."""
         counts: dict[str, float | str] = {"workers": self.workers}
         if self.lost:
@@ -99,10 +99,10 @@ class Workers(Protocol):
     """Computes batches."""
 
     @property
-    def facts(self) -> WorkerStats | None:
+    def stats(self) -> WorkerStats | None:
         """Counts and times of the workers, None without workers."""
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
+    def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         """Compute batches, and yield the result of each once, in any order.
 
         No more batches are taken before their results are requested than there are
@@ -117,30 +117,30 @@ class Workers(Protocol):
 class InProcess:
     """Computes batches one after the other in this process."""
 
-    facts: WorkerStats | None = None
+    stats: WorkerStats | None = None
 
-    def __init__(self, call: Call) -> None:
+    def __init__(self, call: BatchFunction) -> None:
         self._call = call
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
+    def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         """Compute batches in order; see `Workers.results`."""
         for items in batches:
             yield BatchResult(items, self._call(items))
 
 
 class WorkerDiedError(Exception):
-    """Raised by a future if `DEATHS` workers died of its call."""
+    """Raised by a future if `MAX_DEATHS` workers died of its call."""
 
 
 class WorkerExecutor(Executor):
     """An executor that submits a call again if a worker dies of it.
 
-    A future ends with a WorkerDiedError if `DEATHS` died. It ends with a
+    A future ends with a WorkerDiedError if `MAX_DEATHS` died. It ends with a
     BrokenExecutor, or is cancelled, if the connection to the workers was lost; then the
     call has to be submitted again.
     """
 
-    where: str  # what it is, in a user's words
+    description: str  # what it is, in a user's words
     stats: WorkerStats
 
     @abstractmethod

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.cluster import (
-    DEATHS,
+    MAX_DEATHS,
     WorkerDiedError,
     WorkerExecutor,
     WorkerStats,
@@ -33,20 +33,20 @@ from advsearch.cluster.worker import (
     INPUTS,
     Failure,
     Reply,
-    file_digests,
-    own_folder,
+    compute_digests,
+    compute_version,
+    make_private_directory,
     read_files,
-    version,
     write_files,
 )
 from advsearch.errors import ClusterError, FileFormatError, InputError
 from advsearch.settings import read_yaml
 
 # seconds to find a scheduler at first, and to find it again when it has gone
-CONNECT = 30.0
-RECONNECT = 120.0
-LOOK = 0.5  # seconds between two looks at who is there, and between two tries
-TRIES = 10  # of a call that workers cannot begin
+CONNECT_SECONDS = 30.0
+RECONNECT_SECONDS = 120.0
+LOOK_SECONDS = 0.5  # seconds between two looks at who is there, and between two tries
+MAX_TRIES = 10  # of a call that workers cannot begin
 # seconds that a worker may take to end, and that a scheduler may take to say who is
 # there
 RESTART = 20.0
@@ -58,7 +58,7 @@ dies is no error here.
 
 CONFIG = {
     # that of a scheduler started by itself is its own
-    "distributed.scheduler.allowed-failures": DEATHS - 1,
+    "distributed.scheduler.allowed-failures": MAX_DEATHS - 1,
     # a worker that starts on a busy machine takes its time
     "distributed.comm.timeouts.connect": "120s",
     "distributed.comm.timeouts.tcp": "120s",
@@ -79,18 +79,18 @@ NO_WORKER = ("NoValidWorkerError", "NoWorkerError")
 
 
 @dataclass(frozen=True)
-class Site:
+class ClusterSite:
     """Where workers run: the address of a scheduler, or what starts a cluster.
 
     Attributes:
-        where: its name for messages.
+        description: its name for messages.
         address: address of a scheduler that runs.
         start: what starts a cluster.
         security: keywords of Dask's `Security`.
         count: number of workers that it starts with; None for its default.
     """
 
-    where: str
+    description: str
     address: str = ""
     start: Callable[..., Any] | None = None
     security: Mapping[str, object] | None = None
@@ -106,12 +106,12 @@ def make_file_plugin(contents: Mapping[str, bytes]) -> Any:
         def setup(self, worker: Any) -> None:
             # a worker that lacks files says so with its next call
             with suppress(OSError):
-                write_files(contents, own_folder() / INPUTS)
+                write_files(contents, make_private_directory() / INPUTS)
 
     return SentFiles()
 
 
-def call_there(function: Callable[..., Any], *args: Any) -> tuple[str, Any]:
+def call_on_worker(function: Callable[..., Any], *args: Any) -> tuple[str, Any]:
     """Call a function on a worker; return the worker's address and the result."""
     # comes with the extra `dask`
     from distributed import get_worker
@@ -126,9 +126,12 @@ class DaskExecutor(WorkerExecutor):
     """
 
     def __init__(
-        self, site: Site, contents: Mapping[str, bytes], tell: Callable[[str], None]
+        self,
+        site: ClusterSite,
+        contents: Mapping[str, bytes],
+        tell: Callable[[str], None],
     ) -> None:
-        self.where = site.where
+        self.description = site.description
         self.stats = WorkerStats()
         self.link = ""  # of a page that shows the workers; empty where there is none
         self._site = site
@@ -147,7 +150,7 @@ class DaskExecutor(WorkerExecutor):
         self._looked_at = float("-inf")
         self._counted_at = self._alone_since = time.monotonic()
         try:
-            self._open(CONNECT)
+            self._open(CONNECT_SECONDS)
         except BaseException:
             self.shutdown()
             raise
@@ -172,7 +175,7 @@ class DaskExecutor(WorkerExecutor):
                     )
                     if self._site.count is not None:
                         self._cluster.scale(self._site.count)
-                left = max(1.0, min(CONNECT, deadline - time.monotonic()))
+                left = max(1.0, min(CONNECT_SECONDS, deadline - time.monotonic()))
                 where = self._cluster or self._site.address
                 self._client = untyped.Client(
                     where, security=security, timeout=left, set_as_default=False
@@ -187,12 +190,12 @@ class DaskExecutor(WorkerExecutor):
             ) as error:
                 if time.monotonic() >= deadline:
                     raise ClusterError(
-                        f"{self.where}: there is no scheduler that answers "
+                        f"{self.description}: there is no scheduler that answers "
                         f"({error or type(error).__name__}); start "
                         "one with dask scheduler, check address and certificates, and "
                         "go on with advsearch resume"
                     ) from error
-                time.sleep(LOOK)
+                time.sleep(LOOK_SECONDS)
         self._connection = self._client.scheduler_comm
         # what Dask draws its pages with
         drawn = importlib.util.find_spec("bokeh") is not None
@@ -204,7 +207,7 @@ class DaskExecutor(WorkerExecutor):
 
     def count_workers(self) -> int:
         now = time.monotonic()
-        if now - self._looked_at >= LOOK:
+        if now - self._looked_at >= LOOK_SECONDS:
             client = self._client
             # A client that connects again does so by a connection of its own. What was
             # under way is lost all the same.
@@ -243,13 +246,13 @@ class DaskExecutor(WorkerExecutor):
             else {}
         )
         for address, its_version in versions.items():
-            if its_version == version():
+            if its_version == compute_version():
                 fit |= {address}
             elif isinstance(its_version, str):
                 self._refuse(
                     address,
                     f"it has advsearch {its_version}, and "
-                    f"{version()} asks; install the same on both",
+                    f"{compute_version()} asks; install the same on both",
                 )
             elif isinstance(its_version, (ImportError, AttributeError)):
                 self._refuse(
@@ -263,7 +266,7 @@ class DaskExecutor(WorkerExecutor):
     async def _versions(self, workers: list[str]) -> dict[str, Any]:
         """Return the version of advsearch of each worker, or the error of those that fail."""
         found: dict[str, Any] = await self._client.run(
-            version, workers=workers, on_error="return"
+            compute_version, workers=workers, on_error="return"
         )
         return found
 
@@ -280,7 +283,7 @@ class DaskExecutor(WorkerExecutor):
         if now - self._alone_since > patience:
             reasons = "; ".join(dict.fromkeys(self._refused.values()))
             raise ClusterError(
-                f"{self.where}: there was no worker that can do it for {patience:.0f} s"
+                f"{self.description}: there was no worker that can do it for {patience:.0f} s"
                 f"{f' ({reasons})' if reasons else ''}; what was stored is kept, so "
                 "that the run can go on with "
                 "advsearch resume"
@@ -288,14 +291,14 @@ class DaskExecutor(WorkerExecutor):
 
     def _reconnect(self) -> None:
         self._tell(
-            f"{self.where}: the scheduler has gone; what was under way will be "
+            f"{self.description}: the scheduler has gone; what was under way will be "
             "done again"
         )
         self.shutdown()
         self._fit = frozenset()
         self._refused = {}
         self._sending = None
-        self._open(RECONNECT)
+        self._open(RECONNECT_SECONDS)
         self._alone_since = time.monotonic()
 
     # ---- calls
@@ -323,7 +326,7 @@ class DaskExecutor(WorkerExecutor):
         while client.status == "running":
             workers = sorted(self._fit)
             future = client.submit(
-                call_there,
+                call_on_worker,
                 function,
                 *args,
                 workers=workers,
@@ -341,23 +344,23 @@ class DaskExecutor(WorkerExecutor):
                     raise
             except KilledWorker:
                 raise WorkerDiedError(
-                    f"no answer: {DEATHS} workers died of it"
+                    f"no answer: {MAX_DEATHS} workers died of it"
                 ) from None
             except Exception as error:
                 # nothing of ours raises, so the worker could not even begin
                 if future.status == "error" and type(error).__name__ not in NO_WORKER:
                     tries += 1
-                    if tries == TRIES:
+                    if tries == MAX_TRIES:
                         text = f"{type(error).__name__}: {error}"
                         raise ClusterError(
-                            f"{self.where}: a worker cannot begin ({text})"
+                            f"{self.description}: a worker cannot begin ({text})"
                         ) from error
             finally:
                 if client.status == "running":
                     future.release()
             self.stats.retried += 1
-            await asyncio.sleep(LOOK)
-        raise BrokenExecutor(f"{self.where}: the scheduler has gone")
+            await asyncio.sleep(LOOK_SECONDS)
+        raise BrokenExecutor(f"{self.description}: the scheduler has gone")
 
     async def _wait(self, future: Any, workers: list[str]) -> tuple[str, Any] | None:
         """Return what a future ends with, None if none of its allowed workers is left."""
@@ -368,7 +371,7 @@ class DaskExecutor(WorkerExecutor):
 
         fetching = asyncio.ensure_future(fetch())
         try:
-            while not (await asyncio.wait([fetching], timeout=LOOK))[0]:
+            while not (await asyncio.wait([fetching], timeout=LOOK_SECONDS))[0]:
                 if not self._fit.intersection(workers):
                     return None
             return fetching.result()
@@ -418,7 +421,7 @@ class DaskExecutor(WorkerExecutor):
                     end.close(timeout=RESTART)
 
 
-SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
+ADDRESS_SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
 
 JOBS = (
     "SLURMCluster",
@@ -429,7 +432,7 @@ JOBS = (
     "OARCluster",
     "HTCondorCluster",
 )
-CLASSES = {
+CLUSTER_CLASSES = {
     **dict.fromkeys(JOBS, "dask_jobqueue"),
     "KubeCluster": "dask_kubernetes.operator",
 }
@@ -442,21 +445,21 @@ def open_dask(
     task: WorkerTask, workers: int | None, cluster: str, tell: Callable[[str], None]
 ) -> tuple[DaskExecutor, WorkerTask]:
     """Return an executor on a cluster, and the task with the digests of its files."""
-    site = site_of(workers, cluster)
+    site = parse_site(workers, cluster)
     if importlib.util.find_spec("distributed") is None:
         raise InputError(
             "cluster: needs Dask; pip install 'advsearch[dask]', or leave `cluster` out"
         )
     contents = read_files(task)
     return DaskExecutor(site, contents, tell), replace(
-        task, digests=file_digests(contents)
+        task, digests=compute_digests(contents)
     )
 
 
-def site_of(workers: int | None, cluster: str) -> Site:
+def parse_site(workers: int | None, cluster: str) -> ClusterSite:
     """Parse the address of a scheduler, or a YAML file, and how many workers it needs."""
-    if cluster.startswith(SCHEMES):
-        site = Site(cluster, address=cluster)
+    if cluster.startswith(ADDRESS_SCHEMES):
+        site = ClusterSite(cluster, address=cluster)
     elif cluster.endswith((".yaml", ".yml")):
         site = _read_site(Path(cluster), workers)
     else:
@@ -473,7 +476,7 @@ def site_of(workers: int | None, cluster: str) -> Site:
     return site
 
 
-def _read_site(path: Path, workers: int | None) -> Site:
+def _read_site(path: Path, workers: int | None) -> ClusterSite:
     """Read where workers run from a YAML file.
 
     Raises:
@@ -500,7 +503,7 @@ def _read_site(path: Path, workers: int | None) -> Site:
         )
     if "address" in entries:
         address = str(entries["address"])
-        if not address.startswith(SCHEMES):
+        if not address.startswith(ADDRESS_SCHEMES):
             raise FileFormatError(
                 f"{path}: address: expected tcp://HOST:PORT or tls://HOST:PORT"
             )
@@ -508,10 +511,10 @@ def _read_site(path: Path, workers: int | None) -> Site:
             raise FileFormatError(
                 f"{path}: workers: the scheduler says how many there are; leave it out"
             )
-        return Site(address, address=address, security=security or None)
+        return ClusterSite(address, address=address, security=security or None)
     name = str(entries["class"])
     start = partial(_import_cluster(path, name), **(entries.get("arguments") or {}))
-    return Site(name, start=start, security=security or None, count=count or 1)
+    return ClusterSite(name, start=start, security=security or None, count=count or 1)
 
 
 def _check_entries(path: Path, entries: dict[str, Any]) -> None:
@@ -538,14 +541,14 @@ def _check_entries(path: Path, entries: dict[str, Any]) -> None:
 
 def _import_cluster(path: Path, name: str) -> Any:
     """Import a class of Dask that starts a cluster."""
-    if name not in CLASSES:
+    if name not in CLUSTER_CLASSES:
         raise FileFormatError(
-            f"{path}: class: expected one of {', '.join(CLASSES)}, got {name!r}"
+            f"{path}: class: expected one of {', '.join(CLUSTER_CLASSES)}, got {name!r}"
         )
     try:
-        return getattr(importlib.import_module(CLASSES[name]), name)
+        return getattr(importlib.import_module(CLUSTER_CLASSES[name]), name)
     except ImportError:
-        package = CLASSES[name].partition(".")[0].replace("_", "-")
+        package = CLUSTER_CLASSES[name].partition(".")[0].replace("_", "-")
         raise InputError(
             f"cluster: {name} needs {package}; pip install {package}"
         ) from None

@@ -21,11 +21,11 @@ from contextlib import suppress
 from threading import Lock
 from typing import Any
 
-from advsearch.cluster import DEATHS, WorkerDiedError, WorkerExecutor, WorkerStats
-from advsearch.cluster.worker import SERVING
+from advsearch.cluster import MAX_DEATHS, WorkerDiedError, WorkerExecutor, WorkerStats
+from advsearch.cluster.worker import SERVE_VARIABLE
 from advsearch.errors import InputError
 
-BEGIN = (
+START_SECONDS = (
     "import sys; sys.path[:] = sys.argv[1:]; from advsearch.cluster.worker import "
     "serve; serve()"
 )
@@ -36,8 +36,8 @@ class WorkerProcess:
     """One worker, which does one call at a time."""
 
     def __init__(self) -> None:
-        environ = {**os.environ, "OMP_NUM_THREADS": "1", SERVING: "1"}
-        command = [sys.executable, "-c", BEGIN, *sys.path]
+        environ = {**os.environ, "OMP_NUM_THREADS": "1", SERVE_VARIABLE: "1"}
+        command = [sys.executable, "-c", START_SECONDS, *sys.path]
         self._popen = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -81,13 +81,13 @@ class LocalExecutor(WorkerExecutor):
     """An executor of processes, each started when it is needed, and replaced if it dies."""
 
     def __init__(self, count: int) -> None:
-        if SERVING in os.environ:
+        if SERVE_VARIABLE in os.environ:
             raise InputError(
                 "workers: a module that a worker imports asks for workers itself; put "
                 "what it asks under "
                 '`if __name__ == "__main__":`'
             )
-        self.where = f"{count} workers on this machine"
+        self.description = f"{count} workers on this machine"
         self.stats = WorkerStats()
         self._count = count
         # one waits for the answers of each process
@@ -109,7 +109,7 @@ class LocalExecutor(WorkerExecutor):
         return self._threads.submit(self._call, function, args)
 
     def _call(self, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-        for _ in range(DEATHS):
+        for _ in range(MAX_DEATHS):
             process = self._take_process()
             try:
                 value = process.call(function, *args)
@@ -120,7 +120,7 @@ class LocalExecutor(WorkerExecutor):
                 self._busy.discard(process)
                 self._idle.append(process)
             return value
-        raise WorkerDiedError(f"no answer: {DEATHS} workers died of it")
+        raise WorkerDiedError(f"no answer: {MAX_DEATHS} workers died of it")
 
     def _take_process(self) -> WorkerProcess:
         with self._lock:

@@ -31,7 +31,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from advsearch import threads  # before torch: it sets how OpenMP waits
-from advsearch.cluster import Call, WorkerTask
+from advsearch.cluster import BatchFunction, WorkerTask
 from advsearch.errors import (
     AdvsearchError,
     EnvironmentSetupError,
@@ -39,7 +39,7 @@ from advsearch.errors import (
     StorageError,
 )
 from advsearch.files import split_paths
-from advsearch.registry import imported
+from advsearch.registry import load_attribute
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 from advsearch.trust.code import allow_code
 from advsearch.trust.named_files import is_inside
@@ -50,7 +50,7 @@ MachineInfo = dict[str, str]
 
 
 @cache
-def this_machine() -> MachineInfo:
+def describe_machine() -> MachineInfo:
     llvm = ".".join(map(str, ensure_llvm().version))
     return {
         "processor": threads.read_processor_name(),
@@ -59,13 +59,13 @@ def this_machine() -> MachineInfo:
     }
 
 
-def machine_name(machine: MachineInfo) -> str:
+def digest_machine(machine: MachineInfo) -> str:
     """Return a short digest that names a machine."""
     return hashlib.sha256(json.dumps(machine, sort_keys=True).encode()).hexdigest()[:8]
 
 
 @cache
-def version() -> str:
+def compute_version() -> str:
     """Return the version of advsearch, with a digest of its source files.
 
     Development versions of one number differ in the digest.
@@ -85,19 +85,19 @@ def _version(package: str) -> str:
         return "unknown"
 
 
-WITH_OTHERS = {
+REFERRED_SUFFIXES = {
     ".obj": (".mtl",),
     ".gltf": (".bin",),
     ".xml": (".obj", ".ply", ".serialized", ".exr", ".hdr"),
 }
 """Suffixes of files that refer to others, and the suffixes of these besides pictures."""
 
-OF_A_PLACE = (".glb", ".gltf", ".bin", ".exr", ".hdr")
+ENVIRONMENT_SUFFIXES = (".glb", ".gltf", ".bin", ".exr", ".hdr")
 """Suffixes of files besides pictures that the YAML file of an environment may name."""
 
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff")
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff")
 
-LARGEST = 1 << 30
+MAX_SENT_BYTES = 1 << 30
 
 
 class MissingFilesError(Exception):
@@ -119,10 +119,10 @@ def read_files(task: WorkerTask) -> dict[str, bytes]:
             if path.is_absolute() and path.is_file():
                 contents |= _read_with_neighbors(name, path)
     size = sum(map(len, contents.values()))
-    if size > LARGEST:
+    if size > MAX_SENT_BYTES:
         raise InputError(
             f"cluster: the files of the scene and the model have {size >> 20} MiB, and "
-            f"{LARGEST >> 20} can be "
+            f"{MAX_SENT_BYTES >> 20} can be "
             "sent; put them in a folder that all workers see, each under the same path"
         )
     return contents
@@ -131,14 +131,17 @@ def read_files(task: WorkerTask) -> dict[str, bytes]:
 def _read_with_neighbors(setting: str, path: Path) -> dict[str, bytes]:
     """Read a file, and the files in its directory that it may refer to, by path."""
     suffix = path.suffix.lower()
-    suffixes: tuple[str, ...] = WITH_OTHERS.get(suffix, ())
+    suffixes: tuple[str, ...] = REFERRED_SUFFIXES.get(suffix, ())
     if setting == "environment" and suffix in (".yaml", ".yml"):
-        suffixes = OF_A_PLACE
+        suffixes = ENVIRONMENT_SUFFIXES
     contents = {str(path): path.read_bytes()}
     if not suffixes:
         return contents
     for file in sorted(path.parent.rglob("*")):
-        if file.suffix.lower() not in (*suffixes, *PICTURES) or not file.is_file():
+        if (
+            file.suffix.lower() not in (*suffixes, *PICTURE_SUFFIXES)
+            or not file.is_file()
+        ):
             continue
         # no link leads out of the directory
         if is_inside(file, path.parent):
@@ -146,12 +149,12 @@ def _read_with_neighbors(setting: str, path: Path) -> dict[str, bytes]:
     return contents
 
 
-def file_digests(contents: Mapping[str, bytes]) -> dict[str, str]:
+def compute_digests(contents: Mapping[str, bytes]) -> dict[str, str]:
     """Return the SHA-256 of each file by path."""
     return {path: hashlib.sha256(data).hexdigest() for path, data in contents.items()}
 
 
-def sent_paths(digests: Mapping[str, str], folder: Path) -> dict[str, Path]:
+def locate_sent_files(digests: Mapping[str, str], folder: Path) -> dict[str, Path]:
     """Return where files are stored on a worker, by their original paths.
 
     Each set of files has its own directory below `folder`.
@@ -165,7 +168,7 @@ def sent_paths(digests: Mapping[str, str], folder: Path) -> dict[str, Path]:
 
 def write_files(contents: Mapping[str, bytes], folder: Path) -> None:
     """Write files that were sent, each atomically."""
-    paths = sent_paths(file_digests(contents), folder)
+    paths = locate_sent_files(compute_digests(contents), folder)
     for name, data in contents.items():
         path = paths[name]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -174,7 +177,7 @@ def write_files(contents: Mapping[str, bytes], folder: Path) -> None:
         temporary.replace(path)
 
 
-def find_files(task: WorkerTask, folder: Path) -> WorkerTask:
+def resolve_files(task: WorkerTask, folder: Path) -> WorkerTask:
     """Return the task with paths that are valid on this machine.
 
     They are its own if all of its files exist here, else those below `folder`, to
@@ -185,7 +188,7 @@ def find_files(task: WorkerTask, folder: Path) -> WorkerTask:
     """
     if all(_has_digest(Path(path), digest) for path, digest in task.digests.items()):
         return task
-    local_paths = sent_paths(task.digests, folder)
+    local_paths = locate_sent_files(task.digests, folder)
     for path, digest in task.digests.items():
         if not _has_digest(local_paths[path], digest):
             raise MissingFilesError(path)
@@ -227,7 +230,7 @@ LOAD_DEADLINE = 900.0
 KERNELS = "kernels"
 INPUTS = "inputs"
 
-_loaded: OrderedDict[str, Call] = OrderedDict()
+_loaded: OrderedDict[str, BatchFunction] = OrderedDict()
 _batch_lock = threading.Lock()
 
 
@@ -263,13 +266,13 @@ def run_batch(task: WorkerTask, items: Sequence[Any], deadline: float) -> Reply:
     try:
         with _batch_lock:
             start = time.perf_counter()
-            with ended_after(LOAD_DEADLINE):
+            with kill_after(LOAD_DEADLINE):
                 call = load_task(task)
             loading = time.perf_counter() - start
-            with ended_after(deadline):
+            with kill_after(deadline):
                 value = call(items)
             seconds = time.perf_counter() - start - loading
-        return Reply(value, seconds, loading, this_machine(), worker)
+        return Reply(value, seconds, loading, describe_machine(), worker)
     except MissingFilesError as error:
         return Reply(
             worker=worker, failure=Failure.MISSING_FILES, error=f"it lacks {error}"
@@ -289,7 +292,7 @@ def run_batch(task: WorkerTask, items: Sequence[Any], deadline: float) -> Reply:
 
 
 @contextmanager
-def ended_after(seconds: float) -> Iterator[None]:
+def kill_after(seconds: float) -> Iterator[None]:
     """End this process if the block takes longer."""
     faulthandler.dump_traceback_later(seconds, exit=True, file=2)
     try:
@@ -298,7 +301,7 @@ def ended_after(seconds: float) -> Iterator[None]:
         faulthandler.cancel_dump_traceback_later()
 
 
-def load_task(task: WorkerTask) -> Call:
+def load_task(task: WorkerTask) -> BatchFunction:
     """Return the function that computes batches of a task, loaded or cached.
 
     Raises:
@@ -308,15 +311,15 @@ def load_task(task: WorkerTask) -> Call:
     if key in _loaded:
         _loaded.move_to_end(key)
         return _loaded[key]
-    folder = own_folder()
+    folder = make_private_directory()
     if "DRJIT_CACHE_DIR" not in os.environ:
         (folder / KERNELS).mkdir(exist_ok=True)
         os.environ["DRJIT_CACHE_DIR"] = str(folder / KERNELS)
-    this_machine()  # without libLLVM nothing is loaded
+    describe_machine()  # without libLLVM nothing is loaded
     allow_code(*task.code)
-    task = find_files(task, folder / INPUTS)
+    task = resolve_files(task, folder / INPUTS)
     threads.configure(task.threads)
-    make: Callable[[Any], Call] = imported(task.function)
+    make: Callable[[Any], BatchFunction] = load_attribute(task.function)
     while len(_loaded) >= MAX_LOADED:
         _loaded.popitem(last=False)
     _loaded[key] = make(task.settings)
@@ -335,7 +338,7 @@ def task_key(task: WorkerTask) -> str:
     return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()
 
 
-def own_folder() -> Path:
+def make_private_directory() -> Path:
     """Return a directory on this machine that only this user can write to.
 
     It outlives the worker.
@@ -352,7 +355,7 @@ def own_folder() -> Path:
 
 
 # environment variable of a process that runs `serve`
-SERVING = "ADVSEARCH_WORKER"
+SERVE_VARIABLE = "ADVSEARCH_WORKER"
 
 
 def serve() -> None:

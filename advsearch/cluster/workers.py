@@ -30,24 +30,24 @@ from advsearch.cluster.worker import (
     LOAD_DEADLINE,
     Failure,
     Reply,
-    machine_name,
+    describe_machine,
+    digest_machine,
     run_batch,
-    this_machine,
 )
 from advsearch.errors import ClusterError
 from advsearch.interrupts import INTERRUPTS
-from advsearch.registry import imported
+from advsearch.registry import load_attribute
 
 LOCAL = "local"  # the cluster that is this machine
 
 DEADLINE_FACTOR = 10.0  # times the median that a batch may take
 MIN_DEADLINE = 60.0  # seconds that it may take at least
-MEDIAN_OF = 101  # batches, the last ones, of which the median is taken
+MEDIAN_WINDOW = 101  # batches, the last ones, of which the median is taken
 MIN_BATCHES = 5  # that a median takes
 
 # batches that may kill all their workers before a first one is done
 MAX_DEAD_STARTS = 5
-POLL = 0.5  # seconds between two counts of workers
+POLL_SECONDS = 0.5  # seconds between two counts of workers
 
 
 class PoolWorkers:
@@ -60,29 +60,29 @@ class PoolWorkers:
         tell: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.facts: WorkerStats = executor.stats
+        self.stats: WorkerStats = executor.stats
         self._executor = executor
         self._task = task
         self._tell = tell
         self._clock = clock
-        self._this_machine = machine_name(this_machine())
+        self._this_machine = digest_machine(describe_machine())
         self._dead_starts = 0
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
+    def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         """See `Workers.results`."""
         source = iter(batches)
         waiting = deque[Sequence[Any]]()
         running = dict[Future[Reply], Sequence[Any]]()
         ended: queue.SimpleQueue[Future[Reply]] = queue.SimpleQueue()
-        item_seconds = deque[float](maxlen=MEDIAN_OF)
+        item_seconds = deque[float](maxlen=MEDIAN_WINDOW)
         counted_at = self._clock()
         try:
             while True:
                 INTERRUPTS.look()
                 n_workers = self._executor.count_workers()
                 now = self._clock()
-                self.facts.workers = n_workers
-                self.facts.alive += n_workers * (now - counted_at)
+                self.stats.workers = n_workers
+                self.stats.alive += n_workers * (now - counted_at)
                 counted_at = now
                 while len(running) < n_workers and self._take_next(waiting, source):
                     items = waiting.popleft()
@@ -92,7 +92,7 @@ class PoolWorkers:
                     )
                     running[future] = items
                     future.add_done_callback(ended.put)
-                self.facts.most = max(self.facts.most, len(running))
+                self.stats.most = max(self.stats.most, len(running))
                 if not running and not self._take_next(waiting, source):
                     return
                 ended_future = self._wait(ended)
@@ -105,7 +105,7 @@ class PoolWorkers:
                     item_seconds.append(reply.seconds / max(1, len(items)))
                     yield self._read_reply(items, reply)
                 elif isinstance(error, BrokenExecutor):
-                    self.facts.retried += 1
+                    self.stats.retried += 1
                     waiting.appendleft(items)
                 elif not isinstance(error, WorkerDiedError):
                     raise error
@@ -124,7 +124,7 @@ class PoolWorkers:
     def _wait(self, ended: queue.SimpleQueue[Future[Reply]]) -> Future[Reply] | None:
         """Return a future that has ended, None if none ends for a moment."""
         try:
-            return ended.get(timeout=POLL)
+            return ended.get(timeout=POLL_SECONDS)
         except queue.Empty:
             return None
 
@@ -159,15 +159,15 @@ class PoolWorkers:
             raise RuntimeError(f"on {reply.worker}:\n{reply.error}")
         if reply.failure is not None:
             raise ClusterError(reply.error)
-        self.facts.batches += 1
-        self.facts.busy += reply.seconds
-        self.facts.loading += reply.loading
-        self.facts.alive -= reply.loading
-        machine: str | None = machine_name(reply.machine)
+        self.stats.batches += 1
+        self.stats.busy += reply.seconds
+        self.stats.loading += reply.loading
+        self.stats.alive -= reply.loading
+        machine: str | None = digest_machine(reply.machine)
         if machine == self._this_machine:
             machine = None
-        elif machine is not None and machine not in self.facts.machines:
-            self.facts.machines = {**self.facts.machines, machine: reply.machine}
+        elif machine is not None and machine not in self.stats.machines:
+            self.stats.machines = {**self.stats.machines, machine: reply.machine}
             description = ", ".join(
                 f"{key} {text}" for key, text in reply.machine.items()
             )
@@ -184,9 +184,9 @@ class PoolWorkers:
             ClusterError: if as many died, for example while loading, that all will.
         """
         self._dead_starts += 1
-        if self._dead_starts >= MAX_DEAD_STARTS and not self.facts.batches:
+        if self._dead_starts >= MAX_DEAD_STARTS and not self.stats.batches:
             raise ClusterError(
-                f"{self._executor.where}: workers died of the first "
+                f"{self._executor.description}: workers died of the first "
                 f"{self._dead_starts} batches, and none was done; "
                 "try it with workers=null, or see whether a worker has enough memory "
                 "for the scene and the model"
@@ -226,7 +226,7 @@ def open_workers(
     if cluster in (None, LOCAL):
         executor = LocalExecutor(workers or threads.cores())
     else:
-        open_dask = imported("advsearch.cluster.dask_executor:open_dask")
+        open_dask = load_attribute("advsearch.cluster.dask_executor:open_dask")
         executor, task = open_dask(task, workers, cluster, tell)
     try:
         yield PoolWorkers(executor, task, tell)

@@ -11,18 +11,18 @@ from typing import Any
 
 from advsearch.catalog import list_built_ins
 from advsearch.controls.base import (
+    AdjustedDefault,
     Budget,
     Choice,
     Control,
     Group,
-    Moved,
     NumberControl,
     Parameter,
-    check_prepared,
+    list_replaced_settings,
 )
 from advsearch.controls.space import Space
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.options import by_key
+from advsearch.options import group_mitsuba_keys
 from advsearch.registry import Registry, get_class
 from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription
 
@@ -42,11 +42,13 @@ by "package.module:Class".
 """
 
 
-def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Control:
+def make_control(
+    control_name: str, settings: Mapping[str, object] | None = None
+) -> Control:
     """Return a control from its name and settings.
 
     Args:
-        asked: "kind"; "kind:mesh" for what is about one mesh, and that another than the
+        control_name: "kind"; "kind:mesh" for what is about one mesh, and that another than the
             object (pose:chair); else "kind:name" for an instance with a name of its own
             (light:key); or "kind.parameter" to search one parameter only, over its
             default range. With "kind" among the settings, this is the instance's name.
@@ -62,14 +64,14 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     options: dict[str, Any] = {
         name: value for name, value in (settings or {}).items() if value is not None
     }
-    kind, name, parameter = _parse_name(asked, options)
+    kind, name, parameter = _parse_name(control_name, options)
     if kind not in CONTROLS:
-        raise unknown_control(kind)
+        raise make_unknown_control_error(kind)
     control = CONTROLS[kind]
     if parameter is not None:
         options.setdefault(parameter, _get_default_range(control, parameter))
     known = [choice.name for choice in control.choices] + [
-        known.name for known in control.declared(options)
+        known.name for known in control.declare_parameters(options)
     ]
     for setting in options:  # "name" is none that can be given
         if setting not in known:
@@ -79,7 +81,7 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     return control(**options)
 
 
-def unknown_control(
+def make_unknown_control_error(
     kind: str, hint: str = "", instances: Iterable[str] = ()
 ) -> UnknownNameError:
     """Return the error for a control that does not exist.
@@ -100,9 +102,11 @@ def unknown_control(
     return UnknownNameError("control", kind, {*CONTROLS, *instances}, explanation)
 
 
-def names_of(asked: str, given: Mapping[str, object]) -> tuple[str, str]:
+def parse_control_name(
+    control_name: str, settings: Mapping[str, object]
+) -> tuple[str, str]:
     """Return the kind and the instance name that `make_control` would use."""
-    return _parse_name(asked, dict(given))[:2]
+    return _parse_name(control_name, dict(settings))[:2]
 
 
 def _parse_name(
@@ -119,11 +123,11 @@ def _parse_name(
         return str(kind_setting), control_name, None
     if CONTROLS.names_class(control_name):
         return control_name, CONTROLS[control_name].kind, None
-    check_instance(f"`controls` {control_name}", name, colon)
-    return kind, instance_of(kind, name), parameter if dot else None
+    check_instance_name(f"`controls` {control_name}", name, colon)
+    return kind, make_instance_name(kind, name), parameter if dot else None
 
 
-def instance_of(kind: str, name: str) -> str:
+def make_instance_name(kind: str, name: str) -> str:
     """Return the name of an instance.
 
     It is "key" for ``light:key``, but "pose:chair" where the name is that of a mesh,
@@ -135,7 +139,7 @@ def instance_of(kind: str, name: str) -> str:
     return f"{kind}:{name}" if of_a_mesh else name
 
 
-def check_instance(where: str, name: str, colon: str = ":") -> None:
+def check_instance_name(label: str, name: str, colon: str = ":") -> None:
     """Check what stands behind the colon of `KIND:NAME`.
 
     Raises InputError: it has other characters than letters, digits, dashes and
@@ -143,7 +147,7 @@ def check_instance(where: str, name: str, colon: str = ":") -> None:
     """
     if colon and not re.fullmatch(r"[\w-]+", name):
         raise InputError(
-            f"{where}: expected a name of letters, digits, - and _ after "
+            f"{label}: expected a name of letters, digits, - and _ after "
             f"the colon, got {name!r}"
         )
 
@@ -157,7 +161,7 @@ def _get_default_range(control: type[Control], parameter: str) -> object:
         )
     parameter_by_name = {
         declared_parameter.name: declared_parameter
-        for declared_parameter in control.declared((parameter,))
+        for declared_parameter in control.declare_parameters((parameter,))
     }
     if parameter not in parameter_by_name:
         raise UnknownNameError(
@@ -171,13 +175,15 @@ def _get_default_range(control: type[Control], parameter: str) -> object:
     )
 
 
-def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
+def check_control_settings(
+    settings: Mapping[str, object],
+) -> dict[str, Mapping[str, object]]:
     """Return the settings of each control, with ranges of Mitsuba's names under one.
 
     Raises InputError: one has something else than settings.
     """
     by_name: dict[str, Mapping[str, object]] = {}
-    for name, control_settings in by_key(asked).items():
+    for name, control_settings in group_mitsuba_keys(settings).items():
         if control_settings is not None and not isinstance(control_settings, Mapping):
             raise InputError(
                 f"`controls` {name}: expected {{PARAMETER: VALUE}}, got {control_settings!r}"
@@ -186,17 +192,19 @@ def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, obje
     return by_name
 
 
-def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
+def merge_control_settings(
+    settings: Mapping[str, object],
+) -> dict[str, dict[str, object]]:
     """Return settings by control for names as `make_control` takes them.
 
     `camera.azimuth` and `camera.elevation` become one control that searches both.
 
     Args:
-        asked: settings by name; a name may be "kind", "kind:name", "kind.parameter" or
+        settings: settings by name; a name may be "kind", "kind:name", "kind.parameter" or
             "kind:name.parameter".
     """
     by_control: dict[str, dict[str, object]] = {}
-    for name, control_settings in settings_by_name(asked).items():
+    for name, control_settings in check_control_settings(settings).items():
         head, dot, rest = name.partition(".")
         kind = head.partition(":")[0]
         if not dot or kind not in CONTROLS:
@@ -228,7 +236,8 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
         example = f"{first.name}:KEY=[0.2, 0.8]"
         if first.parameters:
             one = next(
-                (one for one in first.own if one.search is not None), first.own[0]
+                (one for one in first.instance_parameters if one.search is not None),
+                first.instance_parameters[0],
             )
             low, high = one.search or (one.low, one.high)
             example = f"{first.name}={{{one.name}: [{low:g}, {high:g}]}}"
@@ -255,7 +264,7 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
             f"light:key,light:fill"
         )
     for control in controls:
-        if control.name != control.kind and control.name in scene.around:
+        if control.name != control.kind and control.name in scene.surrounding_meshes:
             able = ", ".join(
                 kind
                 for kind, usable in CONTROLS.list_usable().items()
@@ -267,14 +276,14 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
                 f"object; {able} can, as in pose:{control.name}"
             )
     described = scene
-    adjusted = list[Moved]()
+    adjusted = list[AdjustedDefault]()
     for control in controls:
         prepared = control.prepare(scene)
-        adjusted += check_prepared(control.name, scene, prepared)
+        adjusted += list_replaced_settings(control.name, scene, prepared)
         scene = prepared
     for control in controls:
         if control.mesh != OBJECT:
-            control.mesh_in(scene)
+            control.get_mesh(scene)
     bound = tuple(control.bind(scene) for control in controls)
     adjusted = sorted(
         [
@@ -282,7 +291,7 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
             *(
                 adjusted_default
                 for control in bound
-                for adjusted_default in control.moved
+                for adjusted_default in control.adjusted_defaults
             ),
         ],
         key=lambda adjusted_default: names.index(adjusted_default.control),
@@ -314,10 +323,10 @@ __all__ = [
     "NumberControl",
     "Parameter",
     "Space",
+    "check_control_settings",
     "compose",
-    "gathered",
     "make_control",
     "make_space",
-    "names_of",
-    "settings_by_name",
+    "merge_control_settings",
+    "parse_control_name",
 ]

@@ -29,9 +29,11 @@ from advsearch.extend import (
     color,
 )
 
-COLOR = "backdrop.color"  # the scene input: (3,) display-linear values in [0, 1]
-WHAT = ("colour", "environment")
-NUMBERS = ("hue", "saturation", "value")
+BACKDROP_COLOR = (
+    "backdrop.color"  # the scene input: (3,) display-linear values in [0, 1]
+)
+BACKDROPS = ("colour", "environment")
+COLOR_PARAMETERS = ("hue", "saturation", "value")
 
 _image = partial(Parameter.number, ("image",))
 
@@ -44,7 +46,7 @@ class BackgroundControl(Control):
     parameters = (
         Parameter.named(
             "what",
-            WHAT,
+            BACKDROPS,
             "colour",
             "What is behind the object: the colour, or the environment as ever.",
         ),
@@ -82,8 +84,9 @@ class BackgroundControl(Control):
         """Check that something can be searched. Raises InputError."""
         super().__init__(name, **settings)
         # a list for `what` alone leaves the colour to be searched
-        self.asked = any(
-            not isinstance(self.specs.get(name, Fixed(0.0)), Fixed) for name in NUMBERS
+        self.has_requested_search = any(
+            not isinstance(self.specs.get(name, Fixed(0.0)), Fixed)
+            for name in COLOR_PARAMETERS
         )
         if self.specs.get("what") == Fixed("environment"):
             raise InputError(
@@ -92,11 +95,14 @@ class BackgroundControl(Control):
                 f"leave the control out"
             )
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
-        as_ever = parameter.name == "what" and "environment" in self.allowed("what")
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
+        as_ever = (
+            parameter.name == "what"
+            and "environment" in self.list_allowed_values("what")
+        )
         return replace(parameter, default="environment") if as_ever else parameter
 
-    def unchanged(self, parameter: Parameter) -> float | str:
+    def get_scene_value(self, parameter: Parameter) -> float | str:
         return "environment" if parameter.name == "what" else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
@@ -106,16 +112,18 @@ class BackgroundControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        if WHAT[int(values["what"])] == "environment":
+        if BACKDROPS[int(values["what"])] == "environment":
             return {}
         return {
-            COLOR: color.srgb_to_linear(hsv_to_rgb(*(values[name] for name in NUMBERS)))
+            BACKDROP_COLOR: color.srgb_to_linear(
+                hsv_to_rgb(*(values[name] for name in COLOR_PARAMETERS))
+            )
         }
 
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        levels = hsv_to_rgb(*(values[name] for name in NUMBERS))
+        levels = hsv_to_rgb(*(values[name] for name in COLOR_PARAMETERS))
         channels = zip(color.CHANNELS, levels, strict=True)
         return {
             name: Value(value=float(level), unit="sRGB") for name, level in channels

@@ -28,28 +28,28 @@ from torch import Tensor
 
 from advsearch.controls.ranges import (
     Fixed,
-    Number,
     OneOf,
+    ParameterValue,
     Range,
     Slot,
     Spec,
-    plain,
-    read,
-    same,
-    shown,
+    format_value,
+    is_same_value,
+    parse_spec,
+    to_plain_value,
 )
 from advsearch.copies import copied, hand_copies, is_ours
-from advsearch.distributions import as_setting
+from advsearch.distributions import distribution_to_setting
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import Value as Value
-from advsearch.options import rounded
+from advsearch.options import format_rounded
 from advsearch.scene.description import (
     ENVIRONMENT,
     OBJECT,
     SceneDescription,
-    check_one_environment,
+    check_single_environment,
 )
-from advsearch.scene.gradients import WHOLE_RANGE as WHOLE_RANGE
+from advsearch.scene.gradients import FULL_RANGE as FULL_RANGE
 from advsearch.scene.gradients import Budget as Budget
 from advsearch.scene.gradients import Group as Group
 from advsearch.scene.parts import MeshPart, PluginPart
@@ -60,16 +60,16 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 # no distance from where a control starts is larger, in whichever norm
-LARGEST_EPSILON = 1e6
+MAX_EPSILON = 1e6
 
 # Where a control leaves out a value of the clean scene that was asked for, the two
 # contradict each other, and that is refused. Where it leaves out only a default, the
 # clean scene has the nearest value that the control allows, and that is said: a
-# `Moved`.
+# `AdjustedDefault`.
 
 
 @dataclass(frozen=True)
-class Moved:
+class AdjustedDefault:
     """A value of the clean scene that a control had to adjust, unrequested.
 
     Attributes:
@@ -84,14 +84,14 @@ class Moved:
     control: str
     parameter: str
     unit: str
-    scene: Number
-    used: Number
+    scene: ParameterValue
+    used: ParameterValue
 
 
-def sentences(moved: Sequence[Moved]) -> list[str]:
+def describe_adjusted_defaults(adjusted: Sequence[AdjustedDefault]) -> list[str]:
     """Return one sentence a control about the values that had to be adjusted."""
     result = []
-    for control, values in groupby(moved, key=lambda value: value.control):
+    for control, values in groupby(adjusted, key=lambda value: value.control):
         adjustments = " and ".join(map(_describe_adjustment, values))
         result.append(
             f"The clean scene has {adjustments}, which the control {control} leaves out."
@@ -99,36 +99,36 @@ def sentences(moved: Sequence[Moved]) -> list[str]:
     return result
 
 
-def _describe_adjustment(value: Moved) -> str:
+def _describe_adjustment(value: AdjustedDefault) -> str:
     """Return a clause such as "pose.yaw 10 degrees instead of 0"."""
     unit = f" {value.unit}"
     if value.unit in ("1", "name") or isinstance(value.used, str):
         unit = ""
-    used = value.used if isinstance(value.used, str) else rounded(value.used)
-    scene = value.scene if isinstance(value.scene, str) else rounded(value.scene)
+    used = value.used if isinstance(value.used, str) else format_rounded(value.used)
+    scene = value.scene if isinstance(value.scene, str) else format_rounded(value.scene)
     if used == scene:
-        used = shown(value.used)
-        scene = shown(value.scene)
+        used = format_value(value.used)
+        scene = format_value(value.scene)
     return f"{value.parameter} {used}{unit} instead of {scene}"
 
 
-def check_prepared(
+def list_replaced_settings(
     control: str, before: SceneDescription, after: SceneDescription
-) -> Iterator[Moved]:
+) -> Iterator[AdjustedDefault]:
     """Yield what a control has replaced in a scene and nobody has described.
 
     Raises InputError: it was requested.
     """
     if after.environment is not None and after.environment is not before.environment:
-        check_one_environment(after.parts, f"`controls` {control}")
-        if ENVIRONMENT in before.given:
+        check_single_environment(after.parts, f"`controls` {control}")
+        if ENVIRONMENT in before.requested:
             raise InputError(
                 f"`environment={before.environment_spec}` and `controls` {control} "
                 "contradict each other: the control "
                 f"puts {after.environment.name} in its place; leave one of the two out"
             )
         if after.environment_spec == before.environment_spec:
-            yield Moved(
+            yield AdjustedDefault(
                 control,
                 ENVIRONMENT,
                 "name",
@@ -137,18 +137,18 @@ def check_prepared(
             )
     for name, value in after.values.items():
         scene = before.values[name]
-        if value is None or scene is None or same(value, scene):
+        if value is None or scene is None or is_same_value(value, scene):
             continue
-        if name in before.given:
+        if name in before.requested:
             raise InputError(
-                f"`set` {name}={shown(scene)} and `controls` {control} contradict each "
+                f"`set` {name}={format_value(scene)} and `controls` {control} contradict each "
                 "other: the control makes it "
-                f"{rounded(value)}; change one of the two, or leave one out"
+                f"{format_rounded(value)}; change one of the two, or leave one out"
             )
-        yield Moved(control, name, SETTINGS[name].unit, scene, value)
+        yield AdjustedDefault(control, name, SETTINGS[name].unit, scene, value)
 
 
-NOTHING: Mapping[str, Tensor] = MappingProxyType({})  # no scene inputs yet
+NO_INPUTS: Mapping[str, Tensor] = MappingProxyType({})  # no scene inputs yet
 
 
 @dataclass(frozen=True)
@@ -183,35 +183,35 @@ class Choice:
     most: float | None = None
     signed: bool = False
 
-    def check(self, control: str, given: object) -> None:
+    def check(self, control: str, value: object) -> None:
         """Check what was chosen in an instance of a control.
 
         None is fine where it is the default. Raises InputError: it cannot be chosen.
         """
-        if given is None and self.default is None:
+        if value is None and self.default is None:
             return
         expected = ""
         is_valid = True
         if self.options:
             expected = f"one of {', '.join(self.options)}"
-            is_valid = given in self.options
+            is_valid = value in self.options
         elif self.whole is not None:
             low, high = self.whole
             expected = f"a whole number from {low} to {high}"
             is_valid = (
-                Parameter.is_number(given)
-                and low <= given <= high
-                and given == int(given)
+                Parameter.is_number(value)
+                and low <= value <= high
+                and value == int(value)
             )
         elif self.most is not None and self.signed:
             expected = f"a number from {-self.most:g} to {self.most:g}"
-            is_valid = Parameter.is_number(given) and abs(given) <= self.most
+            is_valid = Parameter.is_number(value) and abs(value) <= self.most
         elif self.most is not None:
             expected = f"a number over 0 and up to {self.most:g}"
-            is_valid = Parameter.is_number(given) and 0.0 < given <= self.most
+            is_valid = Parameter.is_number(value) and 0.0 < value <= self.most
         if not is_valid:
             raise InputError(
-                f"{control}.{self.name}: expected {expected}, got {given!r}"
+                f"{control}.{self.name}: expected {expected}, got {value!r}"
             )
 
 
@@ -233,7 +233,7 @@ class Control:
 
     Args:
         name: the instance's name; the kind unless given.
-        **settings: a value for any parameter (fixed, range or list) or choice, by name.
+        **to_settings: a value for any parameter (fixed, range or list) or choice, by name.
 
     Attributes:
         kind: the word for it on the command line.
@@ -245,10 +245,10 @@ class Control:
         amount: the parameter whose value in the scene as it was described means that
             the rest of the control does not show: the power of a lamp, say. None where
             the scene has all parameters of itself.
-        own: the parameters of this instance: `declared` of its settings.
+        instance_parameters: the parameters of this instance: `declare_parameters` of its settings.
         chosen: what is chosen, by name; the default where nothing was said.
         specs: what parameters were set to, of those that were given.
-        asked: whether a parameter was given a range or a list.
+        has_requested_search: whether a parameter was given a range or a list.
         scene: once bound, the scene that all controls of the space have prepared.
         start: once bound, (d,) float32 in [0, 1], the value that leaves the scene as it
             is.
@@ -256,7 +256,7 @@ class Control:
             d.
         slots: once bound, each parameter with what it is set to, in the order of its
             coordinates; none where its coordinates are no parameters one by one.
-        moved: once bound, values of the clean scene that the start has not, because the
+        adjusted_defaults: once bound, values of the clean scene that the start has not, because the
             control leaves them out.
         refines: the scene inputs that it takes from the controls before it, and may
             change (a patch on a texture).
@@ -266,7 +266,7 @@ class Control:
             read in, below 0 from the bottom; see `advsearch.scene.formation`.
         flashes: how often a second it changes its light at most.
         travels: whether it moves something along a path; it has `seconds` and
-            `distances()` then, and its parameter `WAY` says which path is taken where
+            `distances()` then, and its parameter `PATH_PARAMETER` says which path is taken where
             there are several.
         competes_with_ambient: whether it throws light that ambient light weakens, see
             `ambient`.
@@ -277,7 +277,7 @@ class Control:
     """
 
     # the parameter that says which of several paths is taken
-    WAY: ClassVar[str] = "way"
+    PATH_PARAMETER: ClassVar[str] = "way"
     kind: ClassVar[str]
     summary: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
@@ -292,7 +292,7 @@ class Control:
     start: Tensor
     groups: tuple[Group, ...]
     slots: tuple[Slot, ...] = ()
-    moved: tuple[Moved, ...] = ()
+    adjusted_defaults: tuple[AdjustedDefault, ...] = ()
     exposure: tuple[float, float] = (0.0, 0.0)
     flashes: float = 0.0
 
@@ -306,9 +306,12 @@ class Control:
     def __init__(self, name: str | None = None, **settings: object) -> None:
         """Read the settings; see the class."""
         self.name = name or self.kind
-        settings = {setting: as_setting(value) for setting, value in settings.items()}
-        self.own = self.declared(settings)
-        parameter_names = [parameter.name for parameter in self.own]
+        settings = {
+            setting: distribution_to_setting(value)
+            for setting, value in settings.items()
+        }
+        self.instance_parameters = self.declare_parameters(settings)
+        parameter_names = [parameter.name for parameter in self.instance_parameters]
         known = parameter_names + [choice.name for choice in self.choices]
         for setting in settings:
             if setting not in known:
@@ -316,11 +319,11 @@ class Control:
                     f"setting of control {self.kind}", setting, known
                 )
         settings_by_name = {
-            setting: plain(value)
+            setting: to_plain_value(value)
             for setting, value in settings.items()
             if value is not None
         }
-        self._given: dict[str, Any] = settings_by_name
+        self._settings: dict[str, Any] = settings_by_name
         self.chosen: dict[str, Any] = {
             choice.name: settings_by_name.get(choice.name, choice.default)
             for choice in self.choices
@@ -329,16 +332,18 @@ class Control:
             choice.check(self.name, self.chosen[choice.name])
         self.check_choices()
         self.specs: dict[str, Spec] = {}
-        for parameter in self.own:
+        for parameter in self.instance_parameters:
             if parameter.name in settings_by_name:
                 label = f"{self.name}.{parameter.name}"
-                self.specs[parameter.name] = read(
+                self.specs[parameter.name] = parse_spec(
                     label, parameter, settings_by_name[parameter.name]
                 )
-        self.asked = any(not isinstance(spec, Fixed) for spec in self.specs.values())
+        self.has_requested_search = any(
+            not isinstance(spec, Fixed) for spec in self.specs.values()
+        )
 
     @classmethod
-    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+    def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the parameters of an instance with some settings, by name.
 
         Those of the class, unless the scene or the settings name them. A mapping has
@@ -352,11 +357,11 @@ class Control:
         By default nothing. Raises InputError: a choice is out of range.
         """
 
-    def settings(self) -> dict[str, object]:
+    def to_settings(self) -> dict[str, object]:
         """Return what `make_control` needs to make an equal instance, as JSON values."""
         if self.name == self.kind:
-            return dict(self._given)
-        return {"kind": self.kind, **self._given}
+            return dict(self._settings)
+        return {"kind": self.kind, **self._settings}
 
     @property
     def mesh(self) -> str:
@@ -369,9 +374,9 @@ class Control:
     @property
     def file_name(self) -> str:
         """Its name as it stands in names of files."""
-        return file_name(self.name)
+        return to_file_name(self.name)
 
-    def mesh_in(self, scene: SceneDescription) -> MeshPart:
+    def get_mesh(self, scene: SceneDescription) -> MeshPart:
         """Return that mesh in a scene.
 
         Raises UnknownNameError: there is none of that name.
@@ -395,14 +400,14 @@ class Control:
             f"It stands in `controls` {self.name}.",
         )
 
-    def setting(self, parameter: Parameter) -> str:
+    def setting_name(self, parameter: Parameter) -> str:
         """Return the name of a parameter among the scene's settings.
 
         Whether or not the scene has it.
         """
         return f"{self.kind if self.mesh == OBJECT else self.name}.{parameter.name}"
 
-    def chosen_form(self, forms: Sequence[str]) -> str:
+    def select_form(self, forms: Sequence[str]) -> str:
         """Return which form of itself a control takes.
 
         Each of its parameters stands for one form, and the choice `form` for any.
@@ -416,7 +421,7 @@ class Control:
         """
         requested = []
         for parameter, form in zip(self.parameters, forms, strict=True):
-            value = self._given.get(parameter.name)
+            value = self._settings.get(parameter.name)
             if value is None:
                 continue
             if value not in (
@@ -429,8 +434,8 @@ class Control:
                     f"{value!r}; set how far it may go with {self.name}.epsilon"
                 )
             requested.append(form)
-        if "form" in self._given:
-            form = str(self._given["form"])
+        if "form" in self._settings:
+            form = str(self._settings["form"])
             requested.append(form)
             if form not in forms:
                 raise UnknownNameError(f"{self.name}.form", form, forms)
@@ -440,25 +445,27 @@ class Control:
             )
         return requested[0] if requested else forms[0]
 
-    def allowed(self, parameter: str, *otherwise: Number) -> tuple[Number, ...]:
+    def list_allowed_values(
+        self, parameter: str, *defaults: ParameterValue
+    ) -> tuple[ParameterValue, ...]:
         """Return the values that a parameter was set to, one by one.
 
         Args:
             parameter: its name.
-            *otherwise: what is returned where it was not set, or has a range.
+            *defaults: what is returned where it was not set, or has a range.
         """
         spec = self.specs.get(parameter)
         if isinstance(spec, OneOf):
             return spec.values
         if isinstance(spec, Fixed):
             return (spec.value,)
-        return otherwise
+        return defaults
 
-    def searches(self, parameter: str) -> bool:
+    def is_searched(self, parameter: str) -> bool:
         """Return whether a parameter with a range of its own is among what is searched."""
         if parameter in self.specs:
             return not isinstance(self.specs[parameter], Fixed)
-        return not self.asked
+        return not self.has_requested_search
 
     # ---- in a scene
 
@@ -469,7 +476,7 @@ class Control:
         """
         return scene
 
-    def within(self, scene: SceneDescription) -> Self:
+    def with_scene(self, scene: SceneDescription) -> Self:
         """Return a copy that has a scene, without a slice of u yet."""
         in_scene = copy.copy(self)
         in_scene.scene = scene if is_ours(type(self)) else copied(scene)
@@ -480,7 +487,7 @@ class Control:
 
         Raises InputError: a setting of the control is impossible in this scene.
         """
-        bound = self.within(scene)
+        bound = self.with_scene(scene)
         bound.fit()
         return bound
 
@@ -491,17 +498,17 @@ class Control:
         """
         slots = list[Slot]()
         begin = 0
-        for parameter, spec in self.laid_out():
+        for parameter, spec in self.list_parameter_specs():
             slot = Slot(parameter, spec, begin)
             slots.append(slot)
-            begin += slot.width
+            begin += slot.n_coordinates
         self.slots = tuple(slots)
-        self.moved = tuple(self._list_adjusted_defaults())
+        self.adjusted_defaults = tuple(self._list_adjusted_defaults())
         self.start = torch.tensor(
-            [coordinate for slot in slots for coordinate in slot.start()],
+            [coordinate for slot in slots for coordinate in slot.start_coordinates()],
             dtype=torch.float32,
         )
-        self.groups = tuple(self._group(slot) for slot in slots if slot.width)
+        self.groups = tuple(self._group(slot) for slot in slots if slot.n_coordinates)
         ranges = [
             slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0)
             for slot in slots
@@ -509,27 +516,27 @@ class Control:
         low_and_span = torch.tensor(
             [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
         ).reshape(-1, 2)
-        widths = torch.tensor([slot.width for slot in slots], dtype=torch.long)
+        widths = torch.tensor([slot.n_coordinates for slot in slots], dtype=torch.long)
         self._low, self._span = low_and_span.T.repeat_interleave(widths, dim=1)
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter as this scene has it.
 
         Its default is its value in the unchanged scene; its search range, unit, shape
         and estimators are those that it has there.
         """
-        value = self.scene.values.get(self.setting(parameter))
+        value = self.scene.values.get(self.setting_name(parameter))
         return parameter if value is None else replace(parameter, default=value)
 
-    def resting(self, name: str) -> Number:
+    def get_clean_value(self, name: str) -> ParameterValue:
         """Return the value of a parameter in the unchanged scene."""
         return next(
-            self.in_scene(parameter).default
-            for parameter in self.own
+            self.resolve_parameter(parameter).default
+            for parameter in self.instance_parameters
             if parameter.name == name
         )
 
-    def unchanged(self, parameter: Parameter) -> Number:
+    def get_scene_value(self, parameter: Parameter) -> ParameterValue:
         """Return the value of a parameter in the scene as it was described.
 
         That is its default, unless that changes the scene. The parameter is as
@@ -537,66 +544,75 @@ class Control:
         """
         return parameter.default
 
-    def spec(self, parameter: Parameter) -> Spec:
+    def get_spec(self, parameter: Parameter) -> Spec:
         """Return what a parameter, as `in_scene` has it, is set to."""
         if parameter.name in self.specs:
             return self.specs[parameter.name]
-        if self.asked or parameter.search is None:
+        if self.has_requested_search or parameter.search is None:
             return Fixed(parameter.default)
         if parameter.options:
             return OneOf(parameter.options)
         return Range(*parameter.search)
 
-    def budget_of(self, parameter: Parameter) -> Budget:
+    def get_budget(self, parameter: Parameter) -> Budget:
         """Return how far a searched parameter may go: by default its whole range."""
-        return WHOLE_RANGE
+        return FULL_RANGE
 
-    def laid_out(self) -> Iterator[tuple[Parameter, Spec]]:
+    def list_parameter_specs(self) -> Iterator[tuple[Parameter, Spec]]:
         """Yield the parameters in the order of their coordinates, with their specs."""
-        for parameter in map(self.in_scene, self.own):
-            yield parameter, self.spec(parameter)
+        for parameter in map(self.resolve_parameter, self.instance_parameters):
+            yield parameter, self.get_spec(parameter)
 
-    def is_compared(self, parameter: Parameter, spec: Spec) -> bool:
+    def must_match_scene(self, parameter: Parameter, spec: Spec) -> bool:
         """Return whether the start has to have the clean scene's value of a parameter.
 
         By default always.
         """
         return True
 
-    def note_moved(self, parameter: Parameter, scene: Number, used: Number) -> None:
+    def record_adjusted_default(
+        self,
+        parameter: Parameter,
+        scene_value: ParameterValue,
+        used_value: ParameterValue,
+    ) -> None:
         """Note that the start has another value of a parameter than the clean scene."""
-        self.moved = (
-            *self.moved,
-            Moved(
-                self.name, f"{self.name}.{parameter.name}", parameter.unit, scene, used
+        self.adjusted_defaults = (
+            *self.adjusted_defaults,
+            AdjustedDefault(
+                self.name,
+                f"{self.name}.{parameter.name}",
+                parameter.unit,
+                scene_value,
+                used_value,
             ),
         )
 
-    def _list_adjusted_defaults(self) -> Iterator[Moved]:
+    def _list_adjusted_defaults(self) -> Iterator[AdjustedDefault]:
         """Yield the values of the clean scene that the start does not have.
 
         Raises InputError: one of them was requested.
         """
         for slot in self.slots:
             parameter = slot.parameter
-            if not self.is_compared(parameter, slot.spec):
+            if not self.must_match_scene(parameter, slot.spec):
                 continue
-            scene_value = self.unchanged(parameter)
+            scene_value = self.get_scene_value(parameter)
             used = slot.start_value()
             hides_others = self.amount not in (None, parameter.name)
-            if hides_others or same(used, scene_value, turns=slot.turns):
+            if hides_others or is_same_value(used, scene_value, is_angle=slot.is_angle):
                 continue
-            setting = self.setting(parameter)
+            setting = self.setting_name(parameter)
             label = f"{self.name}.{parameter.name}"
-            if setting in self.scene.given:
+            if setting in self.scene.requested:
                 raise InputError(
                     f"{self._quote_setting(setting)} and `controls` {self.name} contradict "
                     f"each other: {label} is {slot.spec}, "
-                    f"which leaves {shown(scene_value)} out; change one of the two, or "
+                    f"which leaves {format_value(scene_value)} out; change one of the two, or "
                     "leave one out"
                 )
             if not isinstance(self.specs.get(parameter.name), Fixed):
-                yield Moved(
+                yield AdjustedDefault(
                     self.name,
                     setting if setting == ENVIRONMENT else label,
                     "name" if parameter.options else parameter.unit,
@@ -608,29 +624,29 @@ class Control:
         """Return how a setting of the scene is written, with its value."""
         if setting == ENVIRONMENT:
             return f"`environment={self.scene.environment_spec}`"
-        return f"`set` {setting}={shown(self.scene.number(setting))}"
+        return f"`set` {setting}={format_value(self.scene.number(setting))}"
 
     def _group(self, slot: Slot) -> Group:
         """Return the group of coordinates of a searched parameter."""
         parameter = slot.parameter
         name = parameter.name
         spec = slot.spec
-        setting = self.setting(parameter)
+        setting = self.setting_name(parameter)
         if isinstance(spec, OneOf):
             return Group(
-                name, slot.width, (), options=len(spec.values), setting=setting
+                name, slot.n_coordinates, (), options=len(spec.values), setting=setting
             )
-        budget = self.budget_of(parameter)
-        if type(spec) is not Range and budget != WHOLE_RANGE:
+        budget = self.get_budget(parameter)
+        if type(spec) is not Range and budget != FULL_RANGE:
             raise InputError(
                 f"{self.name}.{name}: it has a ball and no distribution; give it a range"
             )
         return Group(
             name,
-            slot.width,
+            slot.n_coordinates,
             parameter.estimators,
             budget,
-            periodic=slot.periodic,
+            periodic=slot.is_full_turn,
             setting=setting,
         )
 
@@ -642,11 +658,11 @@ class Control:
         """
         return None
 
-    def in_light(self, times: float) -> Self:
+    def scale_ambient(self, factor: float) -> Self:
         """Return the bound control with its ambient light scaled by a factor."""
         return self
 
-    def later(self, seconds: float) -> Control:
+    def advance_time(self, seconds: float) -> Control:
         """Return the control at a later time; itself if it does not depend on time."""
         return self
 
@@ -656,7 +672,7 @@ class Control:
         return (
             max(self.groups, key=lambda group: group.size).budget
             if self.groups
-            else WHOLE_RANGE
+            else FULL_RANGE
         )
 
     @property
@@ -681,14 +697,16 @@ class Control:
             parameter = slot.parameter
             spec = slot.spec
             if isinstance(spec, Range):
-                coordinates = slice(slot.begin, slot.begin + slot.size)
+                coordinates = slice(slot.offset, slot.offset + slot.n_values)
                 if parameter.log or type(spec) is not Range:
-                    value = spec.at(u[coordinates], log=parameter.log)
+                    value = spec.interpolate(u[coordinates], log=parameter.log)
                 else:
                     value = linear[coordinates]
                 values[parameter.name] = value if parameter.shape else value.reshape(())
                 continue
-            constant = spec.value if isinstance(spec, Fixed) else spec.at(u[slot.begin])
+            constant = (
+                spec.value if isinstance(spec, Fixed) else spec.select(u[slot.offset])
+            )
             values[parameter.name] = _to_tensor(constant, slot, u.device)
         return values
 
@@ -702,7 +720,7 @@ class Control:
         return {}
 
     def inputs(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         """Map a slice of u to scene inputs by name.
 
@@ -719,7 +737,7 @@ class Control:
         """Return what the values make of the finished picture; see `picture`."""
         return image
 
-    def picture(self, u: Tensor, image: Tensor) -> Tensor:
+    def apply_to_image(self, u: Tensor, image: Tensor) -> Tensor:
         """Change the finished image, (H, W, 3) display-referred sRGB in [0, 1].
 
         Differentiable in both arguments.
@@ -736,7 +754,7 @@ class Control:
         return {}
 
     def describe(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         """Describe a configuration by a few named values with units.
 
@@ -755,15 +773,15 @@ class Control:
                 option = parameter.options[int(value)]
                 described[name] = {"value": option, "unit": "name"}
             elif value.ndim == 0:
-                described[name] = measure(value, parameter.unit)
+                described[name] = make_value(value, parameter.unit)
             else:
                 for k, number in enumerate(value):
-                    described[f"{name}.{k}"] = measure(number, parameter.unit)
+                    described[f"{name}.{k}"] = make_value(number, parameter.unit)
         for name, measurement in self.measured(values, so_far).items():
             described[f"{self.name}.{name}"] = measurement
         return described
 
-    def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
+    def get_numeric_values(self, u: Tensor) -> Mapping[str, Tensor]:
         """Return the numbers of a configuration by parameter; names are left out.
 
         Each is (k,) or (), in the parameter's unit, and differentiable in u.
@@ -777,7 +795,7 @@ class Control:
         ]
         return {name: values[name] for name in named}
 
-    def printed(self, u: Tensor) -> Tensor | None:
+    def get_printable_colors(self, u: Tensor) -> Tensor | None:
         """Return the searched colors that a printer would print; None without any.
 
         Returns:
@@ -792,8 +810,8 @@ class Control:
         """Return images worth storing; see `artifacts`."""
         return {}
 
-    def artifacts(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+    def get_artifact_images(
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         """Return images worth storing, by file stem.
 
@@ -807,8 +825,8 @@ class Control:
         """Return other files worth storing; see `files`."""
         return {}
 
-    def files(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+    def get_artifact_files(
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, bytes]:
         """Return other files worth storing, by name with suffix, such as a mesh as PLY.
 
@@ -820,7 +838,7 @@ class Control:
 NumberControl = Control  # its name in packages that add controls
 
 
-def _to_tensor(constant: Number, slot: Slot, device: torch.device) -> Tensor:
+def _to_tensor(constant: ParameterValue, slot: Slot, device: torch.device) -> Tensor:
     """Return one number, or the index of a name, in the shape of a parameter."""
     if isinstance(constant, str):
         return torch.full(
@@ -829,7 +847,7 @@ def _to_tensor(constant: Number, slot: Slot, device: torch.device) -> Tensor:
             dtype=torch.float32,
             device=device,
         )
-    shape = (slot.size,) if slot.parameter.shape else ()
+    shape = (slot.n_values,) if slot.parameter.shape else ()
     return torch.full(shape, float(constant), dtype=torch.float32, device=device)
 
 
@@ -837,12 +855,12 @@ METHODS_WITH_COPIES = (
     Control.prepare,
     Control.bind,
     Control.inputs,
-    Control.picture,
+    Control.apply_to_image,
     Control.describe,
-    Control.artifacts,
-    Control.printed,
-    Control.numbers,
-    Control.files,
+    Control.get_artifact_images,
+    Control.get_printable_colors,
+    Control.get_numeric_values,
+    Control.get_artifact_files,
     Control.scene_inputs,
     Control.on_picture,
     Control.measured,
@@ -852,12 +870,12 @@ METHODS_WITH_COPIES = (
 """Methods of controls that get copies of tensors in controls of another package."""
 
 
-def measure(value: Tensor | float, unit: str) -> Value:
+def make_value(value: Tensor | float, unit: str) -> Value:
     """Return a number and its unit, as configurations are described."""
     return {"value": float(value), "unit": unit}
 
 
-def changed(name: str, change: Tensor) -> dict[str, Value]:
+def describe_color_change(name: str, change: Tensor) -> dict[str, Value]:
     """Describe a change of searched colors: the largest, and the root mean square.
 
     Args:
@@ -866,11 +884,11 @@ def changed(name: str, change: Tensor) -> dict[str, Value]:
     """
     root_mean_square = change.square().mean().sqrt()
     return {
-        f"{name}.linf": measure(change.abs().max(), "sRGB"),
-        f"{name}.rms": measure(root_mean_square, "sRGB"),
+        f"{name}.linf": make_value(change.abs().max(), "sRGB"),
+        f"{name}.rms": make_value(root_mean_square, "sRGB"),
     }
 
 
-def file_name(name: str) -> str:
+def to_file_name(name: str) -> str:
     """Return a control's name as file names have it: texture@chair of texture:chair."""
     return name.replace(":", "@")

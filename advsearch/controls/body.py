@@ -29,7 +29,7 @@ class BodyControl(Control):
 
     kind = "body"
     of_a_mesh = True
-    parameters = (*geometry.PERSON, geometry.TIME)
+    parameters = (*geometry.PERSON_PARAMETERS, geometry.TIME)
     choices = (
         Choice(
             "clip",
@@ -39,10 +39,10 @@ class BodyControl(Control):
     )
 
     @classmethod
-    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+    def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         known = {parameter.name for parameter in cls.parameters}
         declared = (
-            geometry.part_of_a_rig(name) for name in settings if name not in known
+            geometry.find_rig_parameter(name) for name in settings if name not in known
         )
         return (
             *cls.parameters,
@@ -52,7 +52,7 @@ class BodyControl(Control):
     @property
     def rig(self) -> assets.MeshRig:
         """What moves the mesh."""
-        mesh = self.mesh_in(self.scene)
+        mesh = self.get_mesh(self.scene)
         if mesh.mesh.rig is None:
             raise InputError(
                 f"`controls` {self.name}: {mesh.name} has no joints; take "
@@ -67,7 +67,7 @@ class BodyControl(Control):
         clips = self.rig.clips
         requested = self.chosen["clip"]
         if requested is None:
-            plays_time = geometry.TIME.name in self.specs or not self._given
+            plays_time = geometry.TIME.name in self.specs or not self._settings
             return clips[0] if clips and plays_time else None
         index = (
             int(requested)
@@ -97,8 +97,8 @@ class BodyControl(Control):
                 raise errors.UnknownNameError(
                     f"parameter of {self.mesh}", name, known, where
                 )
-        if not self._given and not any(
-            self.in_scene(parameter).search for parameter in self.parameters
+        if not self._settings and not any(
+            self.resolve_parameter(parameter).search for parameter in self.parameters
         ):
             example = next((name for name in known if name.endswith(".x")), known[0])
             raise InputError(
@@ -106,15 +106,19 @@ class BodyControl(Control):
                 "ranges, as in "
                 f"{self.name}={{{example}: [-20, 20]}}"
             )
-        self.own = tuple(parameter for parameter in self.own if parameter.name in known)
+        self.instance_parameters = tuple(
+            parameter
+            for parameter in self.instance_parameters
+            if parameter.name in known
+        )
         self.clip  # noqa: B018 - refuses one that is not there
         super().fit()
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with the value of the rig; not searched if the rig lacks it."""
         default = self.rig.defaults.get(parameter.name)
         if default is None:
-            return replace(super().in_scene(parameter), search=None)
+            return replace(super().resolve_parameter(parameter), search=None)
         return replace(parameter, default=default)
 
     def scene_inputs(
@@ -125,4 +129,4 @@ class BodyControl(Control):
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        return dict(self.rig.measured(values, self.clip))
+        return dict(self.rig.get_measurements(values, self.clip))

@@ -22,35 +22,39 @@ from torch import Tensor
 from advsearch.controls.base import Control, Values
 from advsearch.controls.ranges import Fixed
 from advsearch.errors import InputError
-from advsearch.scene.assets import on_roads
+from advsearch.scene.assets import is_road_vehicle
 from advsearch.scene.camera_entries import PRESETS
 from advsearch.scene.camera_model import (
     COEFFICIENTS,
-    NUMBERS,
-    OF_KIND,
+    COEFFICIENTS_OF_KIND,
+    NUMBER_NAMES,
     CameraModel,
-    pinhole,
+    make_pinhole,
 )
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import (
-    STEEPEST,
-    affine,
+    MAX_ELEVATION_SINE,
     camera_to_world,
-    framing_distance,
-    middle,
+    compute_center,
+    compute_framing_distance,
+    make_affine,
 )
-from advsearch.scene.grounds import is_against_traffic, traffic_remark
+from advsearch.scene.grounds import is_against_traffic, make_traffic_remark
 from advsearch.scene.settings import CAMERA, ORBIT_CAMERA, Parameter
 
 # metres above the road from which vehicles are seen: from a bumper to the roof of a
 # lorry
-ROAD_USERS = (0.5, 4.0)
-DISTORTION = {"k": "Radial", "p": "Tangential", "s": "Thin-prism"}
+ROAD_USER_HEIGHTS = (0.5, 4.0)
+DISTORTION_KINDS = {"k": "Radial", "p": "Tangential", "s": "Thin-prism"}
 # width in millimetres of the full-frame sensor that a focal length refers to
 SENSOR_WIDTH = 36.0
 
 
-SAME = (("fov", "focal_length"), ("elevation", "height"), ("distance", "sizes"))
+EQUIVALENT_PARAMETERS = (
+    ("fov", "focal_length"),
+    ("elevation", "height"),
+    ("distance", "sizes"),
+)
 """Pairs of parameters that say the same thing."""
 _moving = partial(Parameter.moving, Parameter.ORBIT)
 _number = partial(Parameter.number, Parameter.ORBIT)
@@ -120,7 +124,7 @@ class CameraControl(Control):
                 -100.0,
                 100.0,
                 0.0,
-                f"{DISTORTION[name[0]]} distortion, as OpenCV has it.",
+                f"{DISTORTION_KINDS[name[0]]} distortion, as OpenCV has it.",
             )
             for name in COEFFICIENTS
         ),
@@ -140,14 +144,14 @@ class CameraControl(Control):
                 f"{scene.camera!r}; leave the control out, or have it seen by "
                 f"{ORBIT_CAMERA!r}"
             )
-        for first, second in SAME:
+        for first, second in EQUIVALENT_PARAMETERS:
             if first in self.specs and second in self.specs:
                 raise InputError(
                     f"`controls` {self.name}: {first} and {second} say the same thing; "
                     "leave one of them out"
                 )
         if "azimuth" in self.specs and self._drives_against_traffic(scene):
-            scene = replace(scene, remarks=(*scene.remarks, traffic_remark(scene)))
+            scene = replace(scene, remarks=(*scene.remarks, make_traffic_remark(scene)))
         has_thin_lens = "aperture" in self.specs or "focus" in self.specs
         if has_thin_lens and self._is_shifted:
             raise InputError(
@@ -157,20 +161,23 @@ class CameraControl(Control):
         bent_coefficients = [name for name in COEFFICIENTS if name in self.specs]
         if bent_coefficients and scene.camera_model is None:
             scene = replace(
-                scene, camera_model=pinhole(scene.number("camera.fov"), scene.aspect)
+                scene,
+                camera_model=make_pinhole(scene.number("camera.fov"), scene.aspect),
             )
         model = scene.camera_model
         if model is None:
             return replace(scene, thin_lens=True) if has_thin_lens else scene
         for name in bent_coefficients:
-            if name not in OF_KIND[model.kind]:
-                coefficients = ", ".join(OF_KIND[model.kind]) or "none"
+            if name not in COEFFICIENTS_OF_KIND[model.kind]:
+                coefficients = ", ".join(COEFFICIENTS_OF_KIND[model.kind]) or "none"
                 raise InputError(
                     f"`controls` {self.name}: a {model.kind} lens has the "
                     f"coefficients {coefficients}, not {name}"
                 )
         lens_parameters = ("fov", "focal_length") if model.name else ()
-        shift_parameters = () if OF_KIND[model.kind] else ("shift_x", "shift_y")
+        shift_parameters = (
+            () if COEFFICIENTS_OF_KIND[model.kind] else ("shift_x", "shift_y")
+        )
         for name in (*lens_parameters, *shift_parameters, "aperture", "focus"):
             if name in self.specs:
                 lens = (
@@ -203,10 +210,10 @@ class CameraControl(Control):
     def _is_shifted(self) -> bool:
         return "shift_x" in self.specs or "shift_y" in self.specs
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with the default and the range of the scene's own camera."""
-        parameter = measured_in(
-            super().in_scene(parameter), self.scene.object.metres is not None
+        parameter = adapt_length_unit(
+            super().resolve_parameter(parameter), self.scene.object.metres is not None
         )
         scene = self.scene
         name = parameter.name
@@ -218,7 +225,8 @@ class CameraControl(Control):
             fixed_lens_scene = self._with_fixed_lens()
             distance = float(
                 np.linalg.norm(
-                    camera_to_world(fixed_lens_scene)[:3, 3] - middle(fixed_lens_scene)
+                    camera_to_world(fixed_lens_scene)[:3, 3]
+                    - compute_center(fixed_lens_scene)
                 )
             )
             default = distance * (1.0 if name == "sizes" else scene.metres)
@@ -237,21 +245,26 @@ class CameraControl(Control):
             scene_azimuth = scene.number("camera.azimuth")
             azimuth_range = (
                 (0.0, 360.0)
-                if preset.aside >= 180.0
-                else (scene_azimuth - preset.aside, scene_azimuth + preset.aside)
+                if preset.search_azimuth >= 180.0
+                else (
+                    scene_azimuth - preset.search_azimuth,
+                    scene_azimuth + preset.search_azimuth,
+                )
             )
-            search = azimuth_range if name == "azimuth" else preset.search.get(name)
-        elif on_roads(scene.object) and name == "elevation":
+            search = (
+                azimuth_range if name == "azimuth" else preset.search_ranges.get(name)
+            )
+        elif is_road_vehicle(scene.object) and name == "elevation":
             search = None
-        elif on_roads(scene.object) and name == "height":
-            search = ROAD_USERS[0], max(ROAD_USERS[1], float(default))
+        elif is_road_vehicle(scene.object) and name == "height":
+            search = ROAD_USER_HEIGHTS[0], max(ROAD_USER_HEIGHTS[1], float(default))
         elif name == "distance" and search is not None:
             search = search[0] * float(default), search[1] * float(default)
         return replace(parameter, default=default, search=search)
 
-    def setting(self, parameter: Parameter) -> str:
+    def setting_name(self, parameter: Parameter) -> str:
         same = {"focal_length": "camera.fov", "sizes": "camera.distance"}
-        return same.get(parameter.name, super().setting(parameter))
+        return same.get(parameter.name, super().setting_name(parameter))
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
@@ -265,12 +278,12 @@ class CameraControl(Control):
             distance = values["sizes"]
         elif (
             "distance" in self.specs
-            or not self.asked
+            or not self.has_requested_search
             or scene.values.get("camera.distance") is not None
         ):
             distance = values["distance"] / scene.metres
         else:
-            distance = framing_distance(scene, fov, scene.aspect).float()
+            distance = compute_framing_distance(scene, fov, scene.aspect).float()
         inputs = {"camera.to_world": self._compute_pose(values, distance)}
         if scene.camera_model is not None:
             inputs["camera.lens"] = self._compute_model_numbers(
@@ -313,7 +326,7 @@ class CameraControl(Control):
             "cx": model_values["cx"] + values["shift_x"],
             "cy": model_values["cy"] + values["shift_y"],
         }
-        return torch.stack([model_values[name].to(fov) for name in NUMBERS])
+        return torch.stack([model_values[name].to(fov) for name in NUMBER_NAMES])
 
     def _with_fixed_lens(self) -> SceneDescription:
         """Return the scene with the field of view that was set.
@@ -339,17 +352,21 @@ class CameraControl(Control):
         keeps_height = "height" in self.specs
         if not {"elevation", "height"} & self.specs.keys():
             is_height_searched = any(
-                slot.width for slot in self.slots if slot.parameter.name == "height"
+                slot.n_coordinates
+                for slot in self.slots
+                if slot.parameter.name == "height"
             )
             keeps_height = (
                 self.scene.values.get("camera.height") is not None or is_height_searched
             )
         if keeps_height:
             height_above_center = values["height"] / self.scene.metres - float(
-                middle(self.scene)[2]
+                compute_center(self.scene)[2]
             )
             elevation = torch.asin(
-                (height_above_center / distance).clamp(-STEEPEST, STEEPEST)
+                (height_above_center / distance).clamp(
+                    -MAX_ELEVATION_SINE, MAX_ELEVATION_SINE
+                )
             )
         zero = torch.zeros_like(azimuth)
         outwards = torch.stack(
@@ -366,19 +383,20 @@ class CameraControl(Control):
             roll.cos() * up - roll.sin() * left,
         )
         position = (
-            torch.from_numpy(middle(self.scene)).to(distance) + distance * outwards
+            torch.from_numpy(compute_center(self.scene)).to(distance)
+            + distance * outwards
         )
-        return affine(torch.stack([left, up, -outwards], dim=1), position)
+        return make_affine(torch.stack([left, up, -outwards], dim=1), position)
 
 
-def measured_in(parameter: Parameter, metres: bool) -> Parameter:
+def adapt_length_unit(parameter: Parameter, has_metres: bool) -> Parameter:
     """Return a parameter in the unit of lengths that a scene has.
 
     That is object sizes around an object without a size in metres.
     """
     return (
         replace(parameter, unit="object sizes")
-        if parameter.unit == "metres" and not metres
+        if parameter.unit == "metres" and not has_metres
         else parameter
     )
 

@@ -41,13 +41,13 @@ from advsearch.extend import (
     parts,
 )
 
-GRID = 128  # cells of the height map along the longer side of the mesh
-ROWS = 40  # heights at which the wall is looked for
-COLUMNS = 96  # directions in which it is looked for
-SHALLOWEST = 0.03  # smallest depth of a vessel in object sizes
-NARROWEST = 5e-4  # smallest opening of a vessel in squared object sizes
-CLOSED = 0.97  # share of the rays that have to meet the wall
-BRIM = 0.985  # a full vessel is filled to this share of its depth
+GRID_CELLS = 128  # cells of the height map along the longer side of the mesh
+WALL_ROWS = 40  # heights at which the wall is looked for
+WALL_DIRECTIONS = 96  # directions in which it is looked for
+MIN_DEPTH = 0.03  # smallest depth of a vessel in object sizes
+MIN_OPENING = 5e-4  # smallest opening of a vessel in squared object sizes
+MIN_HIT_FRACTION = 0.97  # share of the rays that have to meet the wall
+FILL_LIMIT = 0.985  # a full vessel is filled to this share of its depth
 
 INGREDIENTS = ("water", "milk", "coffee")
 """In the order in which they are cut off the stick; what the first two leave is
@@ -58,17 +58,19 @@ REFLECTANCE = {"milk": (0.84, 0.80, 0.70), "coffee": (0.040, 0.016, 0.007)}
 # how strongly each scatters, relative to milk
 SCATTERING = {"milk": 1.0, "coffee": 0.10}
 # what a cup of water leaves of the light that has been to the bottom and back
-WATER = (0.86, 0.94, 0.95)
+WATER_TINT = (0.86, 0.94, 0.95)
 # how fast coffee and milk make water opaque: a tenth of them hides half of the vessel's
 # floor
-DENSITY = 7.0
-TOTAL = 1e-6  # how far proportions may miss one
-RADIUS = 0.995  # the disc ends this close to the wall, as a share of its distance
-FIRST = 0.02
+OPACITY_RATE = 7.0
+SUM_TOLERANCE = 1e-6  # how far proportions may miss one
+DISK_RADIUS_FRACTION = (
+    0.995  # the disc ends this close to the wall, as a share of its distance
+)
+SINKING_LEVEL = 0.02
 """Below this level the disc is drawn together and sunk into the floor, so that an empty
 vessel shows none of it.
 """
-SURFACE = assets.Material(roughness=0.08, specular=0.5)
+LIQUID_MATERIAL = assets.Material(roughness=0.08, specular=0.5)
 
 
 _lit = partial(Parameter.number, Parameter.LIT)
@@ -78,16 +80,16 @@ _lit = partial(Parameter.number, Parameter.LIT)
 class Vessel:
     """The inside of a vessel that stands upright."""
 
-    axis: assets.Doubles  # (2,) x and y of the line that the wall is seen from
-    heights: assets.Doubles  # (R,) evenly spaced z, from the floor to the brim
+    axis: assets.Float64Array  # (2,) x and y of the line that the wall is seen from
+    heights: assets.Float64Array  # (R,) evenly spaced z, from the floor to the brim
     # (R, K) distance of the wall from the axis, in K even directions from +x
     # counter-clockwise
-    radii: assets.Doubles
-    color: assets.Doubles  # (3,) linear reflectance of the wall's lower half
+    radii: assets.Float64Array
+    color: assets.Float64Array  # (3,) linear reflectance of the wall's lower half
 
 
 @lru_cache(maxsize=8)
-def interior(asset: assets.ObjectAsset) -> Vessel | None:
+def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
     """Find the inside of an object in its default pose; None if it is no vessel."""
     mesh = asset.mesh
     basin = _find_basin(mesh)
@@ -95,21 +97,23 @@ def interior(asset: assets.ObjectAsset) -> Vessel | None:
         return None
     axis, floor, rim = basin
     depth = rim - floor
-    heights = np.linspace(floor, floor + BRIM * depth, ROWS)
+    heights = np.linspace(floor, floor + FILL_LIMIT * depth, WALL_ROWS)
     # a ray along a flat floor would see anything
     lowest = floor + 0.004 * depth
     walls = [_find_wall(mesh, axis, max(float(height), lowest)) for height in heights]
     radii = np.stack([distance for distance, _ in walls])
     is_hit = np.isfinite(radii)
-    if is_hit.mean() < CLOSED or not is_hit.any(axis=1).all():
+    if is_hit.mean() < MIN_HIT_FRACTION or not is_hit.any(axis=1).all():
         return None
     medians = np.array([np.median(row[np.isfinite(row)]) for row in radii])
-    lower_faces = np.concatenate([face for _, face in walls[: ROWS // 2]])
+    lower_faces = np.concatenate([face for _, face in walls[: WALL_ROWS // 2]])
     wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
     return Vessel(axis, heights, np.where(is_hit, radii, medians[:, None]), wall_color)
 
 
-def _mean_face_color(asset: assets.ObjectAsset, faces: assets.Ints) -> assets.Doubles:
+def _mean_face_color(
+    asset: assets.ObjectAsset, faces: assets.IntArray
+) -> assets.Float64Array:
     """Return the mean linear color (3,) of the texture at the centers of faces (N,)."""
     mesh = asset.mesh
     centers = mesh.uvs[mesh.faces[faces].astype(np.int64)].mean(axis=1)
@@ -122,7 +126,7 @@ def _mean_face_color(asset: assets.ObjectAsset, faces: assets.Ints) -> assets.Do
     return np.asarray(mean, dtype=np.float64)
 
 
-def _find_basin(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float] | None:
+def _find_basin(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float] | None:
     """Find the largest basin of a mesh.
 
     Returns:
@@ -136,7 +140,7 @@ def _find_basin(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float] | None
     volumes = ndimage.sum_labels(water - ground, labels, np.arange(1, count + 1))
     is_largest = labels == 1 + int(np.argmax(volumes))
     depth = np.where(is_largest, water - ground, 0.0)
-    if depth.max() < SHALLOWEST or is_largest.sum() * cell * cell < NARROWEST:
+    if depth.max() < MIN_DEPTH or is_largest.sum() * cell * cell < MIN_OPENING:
         return None
     row, column = np.nonzero(is_largest)
     weight = depth[is_largest]
@@ -147,7 +151,7 @@ def _find_basin(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float] | None
 
 def _compute_height_map(
     mesh: assets.Mesh,
-) -> tuple[assets.Doubles, float, assets.Doubles]:
+) -> tuple[assets.Float64Array, float, assets.Float64Array]:
     """Compute the highest surface over a grid with an empty margin.
 
     Edges are drawn as well as faces, so that a thin upright wall is not missed between
@@ -159,20 +163,22 @@ def _compute_height_map(
     vertices = mesh.vertices.astype(np.float64)
     lower = vertices[:, :2].min(axis=0)
     upper = vertices[:, :2].max(axis=0)
-    cell = float((upper - lower).max()) / GRID
+    cell = float((upper - lower).max()) / GRID_CELLS
     lower = lower - 1.5 * cell
     width, height = (np.ceil((upper - lower) / cell).astype(np.int64) + 2).tolist()
     ground = np.full((height, width), vertices[:, 2].min() - 1.0)
     corners = vertices[mesh.faces.astype(np.int64)]
     in_cells = (corners[..., :2] - lower) / cell
-    face, row, column, weights = images.pixels_in(in_cells, (height, width))
+    face, row, column, weights = images.rasterize_triangles(in_cells, (height, width))
     np.maximum.at(ground, (row, column), (weights * corners[face, :, 2]).sum(axis=1))
     _draw_edges(ground, in_cells, corners[..., 2])
     return lower, cell, ground
 
 
 def _draw_edges(
-    ground: assets.Doubles, positions: assets.Doubles, heights: assets.Doubles
+    ground: assets.Float64Array,
+    positions: assets.Float64Array,
+    heights: assets.Float64Array,
 ) -> None:
     """Raise a height map (h, w) to the edges of triangles, in place.
 
@@ -190,7 +196,7 @@ def _draw_edges(
             np.maximum.at(ground, (cell[:, 1], cell[:, 0]), height)
 
 
-def _fill_with_water(ground: assets.Doubles) -> assets.Doubles:
+def _fill_with_water(ground: assets.Float64Array) -> assets.Float64Array:
     """Return the level of water on a height map (h, w) from whose edges it runs off.
 
     Every cell stands as high as its ground or its lowest neighbour's water, whichever
@@ -214,8 +220,8 @@ def _fill_with_water(ground: assets.Doubles) -> assets.Doubles:
 
 
 def _find_wall(
-    mesh: assets.Mesh, axis: assets.Doubles, height: float
-) -> tuple[assets.Doubles, assets.Ints]:
+    mesh: assets.Mesh, axis: assets.Float64Array, height: float
+) -> tuple[assets.Float64Array, assets.IntArray]:
     """Cast level rays from the axis at one height, in COLUMNS directions.
 
     Returns:
@@ -224,10 +230,10 @@ def _find_wall(
     """
     face, first_end, second_end = _cut_faces(mesh, height)
     if not len(face):
-        return np.full(COLUMNS, np.inf), np.full(COLUMNS, -1)
+        return np.full(WALL_DIRECTIONS, np.inf), np.full(WALL_DIRECTIONS, -1)
     first_end = first_end - axis
     second_end = second_end - axis
-    angle = np.arange(COLUMNS) * 2.0 * np.pi / COLUMNS
+    angle = np.arange(WALL_DIRECTIONS) * 2.0 * np.pi / WALL_DIRECTIONS
     ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     # on which side of each ray the ends are, (COLUMNS, S)
     first_side = ray[:, :1] * first_end[:, 1] - ray[:, 1:] * first_end[:, 0]
@@ -237,13 +243,13 @@ def _find_wall(
     along_ray = (ray @ first_end.T) * (1.0 - fraction) + (ray @ second_end.T) * fraction
     along_ray = np.where(is_crossed & (along_ray > 0.0), along_ray, np.inf)
     nearest = along_ray.argmin(axis=1)
-    distance = along_ray[np.arange(COLUMNS), nearest]
+    distance = along_ray[np.arange(WALL_DIRECTIONS), nearest]
     return distance, np.where(np.isfinite(distance), face[nearest], -1)
 
 
 def _cut_faces(
     mesh: assets.Mesh, height: float
-) -> tuple[assets.Ints, assets.Doubles, assets.Doubles]:
+) -> tuple[assets.IntArray, assets.Float64Array, assets.Float64Array]:
     """Cut a mesh by a level plane.
 
     Returns:
@@ -313,20 +319,20 @@ class ContentsControl(Control):
         super().__init__(name, **settings)
         # of every ingredient: as set; free if not set and searched; or what the others
         # leave
-        self.bounds = self._read_bounds()
-        least_total = sum(lower for lower, _ in self.bounds.values())
+        self.proportion_bounds = self._read_bounds()
+        least_total = sum(lower for lower, _ in self.proportion_bounds.values())
         self._check_total(least_total)
-        is_searched = not self.asked or any(
+        is_searched = not self.has_requested_search or any(
             isinstance(self.specs.get(name), Range) for name in INGREDIENTS
         )
         rest = max(0.0, 1.0 - least_total)
         for name in ("coffee", "water", "milk"):
-            if name in self.bounds:
+            if name in self.proportion_bounds:
                 continue
             if is_searched:
-                self.bounds[name] = (0.0, rest)
+                self.proportion_bounds[name] = (0.0, rest)
             else:
-                self.bounds[name] = (rest, rest)
+                self.proportion_bounds[name] = (rest, rest)
                 rest = 0.0
 
     def _read_bounds(self) -> dict[str, tuple[float, float]]:
@@ -357,15 +363,15 @@ class ContentsControl(Control):
 
     def _check_total(self, least_total: float) -> None:
         """Check that the proportions can add up to 1. Raises InputError: they cannot."""
-        largest_total = sum(upper for _, upper in self.bounds.values())
-        all_set = len(self.bounds) == len(INGREDIENTS)
-        too_little = all_set and largest_total < 1.0 - TOTAL
-        if least_total <= 1.0 + TOTAL and not too_little:
+        largest_total = sum(upper for _, upper in self.proportion_bounds.values())
+        all_set = len(self.proportion_bounds) == len(INGREDIENTS)
+        too_little = all_set and largest_total < 1.0 - SUM_TOLERANCE
+        if least_total <= 1.0 + SUM_TOLERANCE and not too_little:
             return
         stated = []
         for name in INGREDIENTS:
-            if name in self.bounds:
-                ends = dict.fromkeys(f"{end:g}" for end in self.bounds[name])
+            if name in self.proportion_bounds:
+                ends = dict.fromkeys(f"{end:g}" for end in self.proportion_bounds[name])
                 stated.append(f"{name} {' to '.join(ends)}")
         raise InputError(
             f"`controls` {self.name}: expected proportions of water, milk and "
@@ -375,7 +381,7 @@ class ContentsControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Add the surface of the liquid. Raises InputError: the object is no vessel."""
-        vessel = interior(scene.object)
+        vessel = find_interior(scene.object)
         if vessel is None:
             raise InputError(
                 f"`controls` {self.name}: expected a vessel, open at the top and "
@@ -383,17 +389,19 @@ class ContentsControl(Control):
                 f"bowl, a glass), got {scene.object.name!r}; choose another object or "
                 "leave the control out"
             )
-        angle = np.arange(COLUMNS) * 2.0 * np.pi / COLUMNS
+        angle = np.arange(WALL_DIRECTIONS) * 2.0 * np.pi / WALL_DIRECTIONS
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         uvs = np.concatenate([[(0.5, 0.5)], 0.5 + 0.45 * circle])
         vertices = _liquid_surface(vessel, torch.tensor(0.5)).numpy()
         mesh = replace(
-            parts.polygon(COLUMNS), vertices=vertices, uvs=uvs.astype(np.float32)
+            parts.make_polygon(WALL_DIRECTIONS),
+            vertices=vertices,
+            uvs=uvs.astype(np.float32),
         )
         black = np.zeros((4, 4, 3), dtype=np.float32)
         pose = geometry.object_to_world(scene)
         return scene.with_part(
-            parts.MeshPart(self.name, mesh, black, SURFACE, to_world=pose)
+            parts.MeshPart(self.name, mesh, black, LIQUID_MATERIAL, to_world=pose)
         )
 
     def fit(self) -> None:
@@ -404,14 +412,14 @@ class ContentsControl(Control):
             for parameter in self.parameters
             if parameter.name in INGREDIENTS
         }
-        cuts = self.cuts(defaults)
+        cuts = self.find_cuts(defaults)
         for slot in self.slots:
-            if slot.width and slot.parameter.name in cuts:
-                self.start[slot.begin] = cuts[slot.parameter.name]
+            if slot.n_coordinates and slot.parameter.name in cuts:
+                self.start[slot.offset] = cuts[slot.parameter.name]
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
         values = super().values(u)  # of ingredients, where the stick is cut
-        return {**values, **self.proportions(values)}
+        return {**values, **self.cut_proportions(values)}
 
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
@@ -424,7 +432,7 @@ class ContentsControl(Control):
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the offsets, the pose and the color of the liquid's surface."""
-        vessel = interior(self.scene.object)
+        vessel = find_interior(self.scene.object)
         assert vessel is not None  # see `prepare`
         base = _liquid_surface(vessel, torch.full_like(values["level"], 0.5))
         surface = _liquid_surface(vessel, values["level"])
@@ -433,23 +441,25 @@ class ContentsControl(Control):
             inputs[f"{self.name}.to_world"] = so_far["object.to_world"]
         proportions = torch.stack([values[name] for name in INGREDIENTS])
         vessel_color = torch.from_numpy(vessel.color).to(proportions)
-        inputs[f"{self.name}.base_color"] = liquid(proportions, vessel_color).expand(
-            4, 4, 3
-        )
+        inputs[f"{self.name}.base_color"] = mix_liquid_color(
+            proportions, vessel_color
+        ).expand(4, 4, 3)
         return inputs
 
     # ---- proportions
 
-    def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
+    def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
         """Return where the stick may be cut, from 0 to 1 of what is possible there."""
         if parameter.name not in INGREDIENTS:
-            return super().spec(parameter)
+            return super().get_spec(parameter)
         free = [
-            name for name in INGREDIENTS if self.bounds[name][1] > self.bounds[name][0]
+            name
+            for name in INGREDIENTS
+            if self.proportion_bounds[name][1] > self.proportion_bounds[name][0]
         ]
         return Range(0.0, 1.0) if parameter.name in free[:-1] else Fixed(0.0)
 
-    def proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def cut_proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Cut the stick: return proportions that add up to one; differentiable.
 
         Args:
@@ -463,13 +473,13 @@ class ContentsControl(Control):
             left = left - proportions[name]
         return proportions
 
-    def cuts(self, shares: Mapping[str, float]) -> dict[str, float]:
+    def find_cuts(self, proportions: Mapping[str, float]) -> dict[str, float]:
         """Return the cuts whose proportions are nearest to some, by ingredient."""
         left = torch.ones(())
         cuts = dict[str, float]()
         for name in INGREDIENTS:
             lower, upper = map(float, self._possible_range(name, left))
-            proportion = min(max(shares[name], lower), max(lower, upper))
+            proportion = min(max(proportions[name], lower), max(lower, upper))
             cuts[name] = 0.0
             if upper > lower:
                 cuts[name] = (proportion - lower) / (upper - lower)
@@ -487,7 +497,7 @@ class ContentsControl(Control):
         """
         index = INGREDIENTS.index(name)
         limits = left.new_tensor(
-            [self.bounds[ingredient] for ingredient in INGREDIENTS]
+            [self.proportion_bounds[ingredient] for ingredient in INGREDIENTS]
         )
         lower, upper = limits[index]
         rest_lower, rest_upper = limits[index + 1 :].sum(dim=0)
@@ -499,27 +509,29 @@ class ContentsControl(Control):
 # ---- how it looks
 
 
-def liquid(shares: Tensor, vessel: Tensor) -> Tensor:
+def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
     """Return the linear reflectance (3,) of a cup of water, milk and coffee.
 
     After Kubelka and Munk (1931).
 
     Args:
-        shares: proportions (3,) in the order of `INGREDIENTS`.
-        vessel: linear reflectance (3,) of the vessel's inside.
+        proportions: proportions (3,) in the order of `INGREDIENTS`.
+        vessel_color: linear reflectance (3,) of the vessel's inside.
     """
-    amounts = dict(zip(INGREDIENTS, shares, strict=True))
-    absorbed = shares.new_zeros(3)
-    scattered = shares.new_tensor(1e-6)
+    amounts = dict(zip(INGREDIENTS, proportions, strict=True))
+    absorbed = proportions.new_zeros(3)
+    scattered = proportions.new_tensor(1e-6)
     for name, reflectance in REFLECTANCE.items():
-        deep = shares.new_tensor(reflectance)
+        deep = proportions.new_tensor(reflectance)
         scattering = amounts[name] * SCATTERING[name]
         absorbed = absorbed + scattering * (1.0 - deep).square() / (2.0 * deep)
         scattered = scattered + scattering
     ratio = absorbed / scattered
     milky = 1.0 + ratio - (ratio.square() + 2.0 * ratio + 1e-9).sqrt()
-    opacity = 1.0 - torch.exp(-DENSITY * (amounts["milk"] + amounts["coffee"]))
-    return opacity * milky + (1.0 - opacity) * vessel * shares.new_tensor(WATER)
+    opacity = 1.0 - torch.exp(-OPACITY_RATE * (amounts["milk"] + amounts["coffee"]))
+    return opacity * milky + (1.0 - opacity) * vessel_color * proportions.new_tensor(
+        WATER_TINT
+    )
 
 
 def _liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
@@ -533,12 +545,16 @@ def _liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
     radii = torch.from_numpy(vessel.radii).to(level)
     position = level * (len(heights) - 1)
     row = int(position.detach().clamp(0, len(heights) - 2))
-    radius = torch.lerp(radii[row], radii[row + 1], position - row) * RADIUS
+    radius = (
+        torch.lerp(radii[row], radii[row + 1], position - row) * DISK_RADIUS_FRACTION
+    )
     # 1 above the level at which the disk is drawn together
-    opening = (level / FIRST).clamp(1e-3, 1.0)
+    opening = (level / SINKING_LEVEL).clamp(1e-3, 1.0)
     depth = heights[-1] - heights[0]
-    height = heights[0] + level * depth - (1.0 - opening) * FIRST * depth
-    angle = torch.arange(COLUMNS, device=level.device) * (2.0 * torch.pi / COLUMNS)
+    height = heights[0] + level * depth - (1.0 - opening) * SINKING_LEVEL * depth
+    angle = torch.arange(WALL_DIRECTIONS, device=level.device) * (
+        2.0 * torch.pi / WALL_DIRECTIONS
+    )
     circle = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
     rim = circle * (radius * opening)[:, None]
     flat = torch.cat([rim.new_zeros(1, 2), rim]) + torch.from_numpy(vessel.axis).to(

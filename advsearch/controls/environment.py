@@ -7,7 +7,7 @@ map is resampled by torch:
     map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1]
     rotation / 360 * columns = k + f
 
-`harmonics` adds real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan
+`compute_harmonic_light` adds real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan
 2001, section 3), 9 coefficients for each colour channel as multiples of the map's mean
 radiance, inside an L2 ball.
 """
@@ -23,19 +23,24 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Control, Values
-from advsearch.controls.ranges import Fixed, Number, Range
+from advsearch.controls.base import FULL_RANGE, Budget, Choice, Control, Values
+from advsearch.controls.ranges import Fixed, ParameterValue, Range
 from advsearch.errors import InputError
 from advsearch.scene import library, settings
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription, is_path
-from advsearch.scene.formation import metered_gain
-from advsearch.scene.geometry import real_harmonics
+from advsearch.scene.description import (
+    ENVIRONMENT,
+    SCENE_ENVIRONMENT,
+    SceneDescription,
+    is_path,
+)
+from advsearch.scene.formation import compute_metered_gain
+from advsearch.scene.geometry import compute_real_harmonics
 from advsearch.scene.library import import_environment
 from advsearch.scene.settings import CHANNELS, Parameter
 
-COEFFICIENTS = 27  # degrees 0 to 2 of three colour channels
-MAPS = tuple(
+N_COEFFICIENTS = 27  # degrees 0 to 2 of three colour channels
+BUNDLED_MAPS = tuple(
     sorted({*library.list_environments()} - {*library.list_environments("place")})
 )
 """The bundled environments that are a map; the others are a place around the object."""
@@ -51,8 +56,8 @@ class EnvironmentControl(Control):
     parameters = (
         Parameter.named(
             "which",
-            (OWN_MAP, *MAPS),
-            OWN_MAP,
+            (SCENE_ENVIRONMENT, *BUNDLED_MAPS),
+            SCENE_ENVIRONMENT,
             "Another environment instead of the scene's own, metered "
             "afresh: bundled, or a .hdr or .exr "
             "file.",
@@ -64,7 +69,7 @@ class EnvironmentControl(Control):
         ),
         Parameter(
             "harmonics",
-            (COEFFICIENTS,),
+            (N_COEFFICIENTS,),
             "mean radiances",
             -1.0,
             1.0,
@@ -79,7 +84,7 @@ class EnvironmentControl(Control):
         Choice(
             "epsilon",
             0.5,
-            "Radius of the ball of `harmonics`: L2 norm of all coefficients.",
+            "Radius of the ball of `compute_harmonic_light`: L2 norm of all coefficients.",
             "epsilon",
             "harmonics",
             most=100.0,
@@ -87,7 +92,7 @@ class EnvironmentControl(Control):
     )
 
     @classmethod
-    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+    def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the parameters, with the files that `which` names among its options."""
         which, *others = cls.parameters
         setting = settings.get("which") if isinstance(settings, Mapping) else None
@@ -109,7 +114,7 @@ class EnvironmentControl(Control):
 
     def check_choices(self) -> None:
         epsilon = self.chosen["epsilon"]
-        if "epsilon" in self._given and "harmonics" not in self._given:
+        if "epsilon" in self._settings and "harmonics" not in self._settings:
             raise InputError(
                 f"{self.name}.epsilon: the radius of the ball of harmonics, which are "
                 "not there; leave it out, or give "
@@ -124,7 +129,7 @@ class EnvironmentControl(Control):
         them.
         """
         spec = self.specs.get("which")
-        allowed = self.allowed("which", OWN_MAP)
+        allowed = self.list_allowed_values("which", SCENE_ENVIRONMENT)
         maps = {
             str(name): _load_environment(str(name))
             for name in allowed
@@ -132,11 +137,11 @@ class EnvironmentControl(Control):
         }
         notes = [note for asset in maps.values() for note in asset.warnings]
         if (
-            OWN_MAP in allowed
+            SCENE_ENVIRONMENT in allowed
             or self._find_scene_environment_name(scene) is not None
             or not (isinstance(spec, Fixed) or maps)
         ):
-            lit = scene.environment_for(f"`controls` {self.name}")
+            lit = scene.require_environment(f"`controls` {self.name}")
             if (
                 maps
                 and scene.photograph is None
@@ -156,25 +161,31 @@ class EnvironmentControl(Control):
             )
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter; the default of `which` is the scene's own environment.
 
         It has its name where only that is allowed.
         """
         if parameter.name != "which":
-            return super().in_scene(parameter)
+            return super().resolve_parameter(parameter)
         own_environment = (
             None
-            if OWN_MAP in self.allowed("which", OWN_MAP)
+            if SCENE_ENVIRONMENT in self.list_allowed_values("which", SCENE_ENVIRONMENT)
             else self._find_scene_environment_name(self.scene)
         )
-        return replace(parameter, default=own_environment or OWN_MAP)
+        return replace(parameter, default=own_environment or SCENE_ENVIRONMENT)
 
-    def setting(self, parameter: Parameter) -> str:
-        return ENVIRONMENT if parameter.name == "which" else super().setting(parameter)
+    def setting_name(self, parameter: Parameter) -> str:
+        return (
+            ENVIRONMENT
+            if parameter.name == "which"
+            else super().setting_name(parameter)
+        )
 
-    def unchanged(self, parameter: Parameter) -> Number:
-        if parameter.name != "which" or OWN_MAP in self.allowed("which", OWN_MAP):
+    def get_scene_value(self, parameter: Parameter) -> ParameterValue:
+        if parameter.name != "which" or SCENE_ENVIRONMENT in self.list_allowed_values(
+            "which", SCENE_ENVIRONMENT
+        ):
             return parameter.default
         return (
             self._find_scene_environment_name(self.scene) or self.scene.environment_spec
@@ -188,15 +199,15 @@ class EnvironmentControl(Control):
         return next(
             (
                 str(name)
-                for name in self.allowed("which", OWN_MAP)
+                for name in self.list_allowed_values("which", SCENE_ENVIRONMENT)
                 if _is_scene_environment(name, scene)
             ),
             None,
         )
 
-    def budget_of(self, parameter: Parameter) -> Budget:
+    def get_budget(self, parameter: Parameter) -> Budget:
         if parameter.name != "harmonics":
-            return WHOLE_RANGE
+            return FULL_RANGE
         spec = self.specs["harmonics"]
         width = spec.high - spec.low if isinstance(spec, Range) else 2.0
         return Budget("l2", float(self.chosen["epsilon"]) / width)
@@ -205,30 +216,34 @@ class EnvironmentControl(Control):
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the map (H, W, 3) of linear radiance."""
-        name = self.own[0].options[int(values["which"])]
+        name = self.instance_parameters[0].options[int(values["which"])]
         device = values["rotation"].device
-        is_scene_map = name == OWN_MAP or _is_scene_environment(name, self.scene)
+        is_scene_map = name == SCENE_ENVIRONMENT or _is_scene_environment(
+            name, self.scene
+        )
         base = _load_map(
             None if is_scene_map else _load_environment(name), self.scene
         ).to(device)
-        rotated = turn(
+        rotated = rotate_map(
             base, values["rotation"] - self.scene.number("environment.rotation")
         )
         tint = torch.stack([values[f"tint_{color}"] for color in CHANNELS])
         stops = values["exposure"] - self.scene.number("environment.exposure")
         lit = rotated * tint * torch.exp2(stops)
         if "harmonics" in self.specs:
-            lit = (lit + harmonics(values["harmonics"], base)).clamp_min(0.0)
+            lit = (lit + compute_harmonic_light(values["harmonics"], base)).clamp_min(
+                0.0
+            )
         return {"environment.data": lit}
 
 
-def _is_file(name: Number) -> bool:
+def _is_file(name: ParameterValue) -> bool:
     return (
         isinstance(name, str) and name not in EnvironmentControl.parameters[0].options
     )
 
 
-def _is_scene_environment(name: Number, scene: SceneDescription) -> bool:
+def _is_scene_environment(name: ParameterValue, scene: SceneDescription) -> bool:
     """Return whether an environment is the scene's own."""
     environment = scene.environment
     if environment is None or not _is_file(name):
@@ -270,17 +285,21 @@ def _load_map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor
     Another one is as bright as keeps the exposure of the image; the ground stays of the
     same kind.
     """
-    scene_environment = scene.environment_for("the environment")
+    scene_environment = scene.require_environment("the environment")
     if asset is None:
         return torch.from_numpy(scene_environment.radiance.copy())
     other_scene = replace(
         scene, environment=replace(asset, photographed=scene_environment.photographed)
     )
-    factor = metered_gain(other_scene) / metered_gain(scene) if scene.metered else 1.0
+    factor = (
+        compute_metered_gain(other_scene) / compute_metered_gain(scene)
+        if scene.metered
+        else 1.0
+    )
     return torch.from_numpy(asset.radiance.copy()) * factor
 
 
-def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
+def rotate_map(radiance: Tensor, degrees: Tensor) -> Tensor:
     """Rotate a map (H, W, 3) about the vertical by linear resampling of its columns.
 
     As `environment.rotation` does.
@@ -298,14 +317,14 @@ def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
     return lower + fraction * (upper - lower)
 
 
-def harmonics(coefficients: Tensor, like: Tensor) -> Tensor:
+def compute_harmonic_light(coefficients: Tensor, reference: Tensor) -> Tensor:
     """Return light (H, W, 3) from 9 spherical-harmonic coefficients a channel.
 
     Args:
         coefficients: (27,), multiples of the map's mean.
-        like: the map (H, W, 3).
+        reference: the map (H, W, 3).
     """
-    height, width = like.shape[:2]
-    basis = real_harmonics(height, width).to(coefficients.device)
-    mean = like.detach().mean(dim=(0, 1))
+    height, width = reference.shape[:2]
+    basis = compute_real_harmonics(height, width).to(coefficients.device)
+    mean = reference.detach().mean(dim=(0, 1))
     return basis @ coefficients.reshape(9, 3) * mean

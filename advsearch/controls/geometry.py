@@ -33,54 +33,62 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from advsearch.controls.base import (
-    NOTHING,
+    NO_INPUTS,
     Choice,
     Control,
     Group,
     Parameter,
     Value,
-    measure,
+    make_value,
 )
 from advsearch.scene.assembly import MovingMesh
-from advsearch.scene.assets import Doubles, Ints, Mesh, face_vectors
-from advsearch.scene.raster import welded
+from advsearch.scene.assets import Float64Array, IntArray, Mesh, compute_area_vectors
+from advsearch.scene.raster import weld_vertices
 
-CELL = 0.035
+CELL_SIZE = 0.035
 """Side of the cubes that the surface is thinned to one point in, in extents of the
 mesh; larger if that is too many.
 """
-LANDMARKS = 900  # largest number of such points
-SAMPLES = 20000
+MAX_LANDMARKS = 900  # largest number of such points
+N_SURFACE_SAMPLES = 20000
 """Points spread over the surface before they are thinned, so that large triangles count
 as what they cover.
 """
 BANDWIDTH = 1.8  # standard deviation of the kernel, in cells
 # largest displacement gradient along a face; below 1 no face can turn over
-FACE_STRAIN = 0.7
-WALL_STRAIN = 0.5  # largest change of the distance between two walls, as a share of it
-WALL_REACH = 0.3  # walls further apart than this, in extents, are not held together
-OPPOSITE = -0.3  # largest cosine between the normals of the two sides of a wall
-THIN_FACE = 2e-3
+MAX_FACE_STRAIN = 0.7
+MAX_WALL_STRAIN = (
+    0.5  # largest change of the distance between two walls, as a share of it
+)
+MAX_WALL_DISTANCE = (
+    0.3  # walls further apart than this, in extents, are not held together
+)
+MAX_OPPOSITE_COSINE = (
+    -0.3
+)  # largest cosine between the normals of the two sides of a wall
+MIN_FACE_HEIGHT = 2e-3
 """Faces whose height is less than this share of their longest edge are slivers: their
 strain is not looked at.
 """
-SHARPNESS = 32  # exponent p of the norm that stands in for a maximum
+NORM_EXPONENT = 32  # exponent p of the norm that stands in for a maximum
 # distance over which a push on one vertex spreads, in extents (form large-steps)
 SMOOTHING_LENGTH = 0.1
 WALL_WEIGHT = 4.0  # weight of a link through a wall, in edges of the mesh
 
 
-class Body:
+class WeldedMesh:
     """A mesh whose seams are welded: what a displacement acts on."""
 
     def __init__(self, mesh: Mesh) -> None:
         """Weld the seams of a mesh, and find its walls."""
-        self.index, count = welded(mesh)  # (V,) the position of each vertex
-        self.places = np.zeros((count, 3))  # distinct vertex positions
-        self.places[self.index] = mesh.vertices
-        self.extent = float(np.ptp(self.places, axis=0).max())
-        faces = self.index[mesh.faces]
-        area_vectors = face_vectors(self.places[faces])
+        self.position_of_vertex, count = weld_vertices(
+            mesh
+        )  # (V,) the position of each vertex
+        self.positions = np.zeros((count, 3))  # distinct vertex positions
+        self.positions[self.position_of_vertex] = mesh.vertices
+        self.extent = float(np.ptp(self.positions, axis=0).max())
+        faces = self.position_of_vertex[mesh.faces]
+        area_vectors = compute_area_vectors(self.positions[faces])
         # over positions, without those that have no area
         self.faces = faces[np.linalg.norm(area_vectors, axis=1) > 0.0]
         summed = np.zeros((count, 3))
@@ -92,21 +100,21 @@ class Body:
         # (W, 2) positions on opposite sides of a wall or of a gap
         self.walls = self._find_walls()
 
-    def _find_walls(self) -> Ints:
+    def _find_walls(self) -> IntArray:
         """Return pairs (W, 2) of positions on opposite sides of a wall or of a gap.
 
         The partner of a position is the nearest one with an opposite normal, by
         |x - y|^2 + b^2 |n + m|^2: a search in six dimensions.
         """
         scaled_normals = 0.1 * self.extent * self.normals
-        tree = cKDTree(np.hstack([self.places, scaled_normals]))
-        partner = tree.query(np.hstack([self.places, -scaled_normals]))[1]
-        distance = np.linalg.norm(self.places - self.places[partner], axis=1)
+        tree = cKDTree(np.hstack([self.positions, scaled_normals]))
+        partner = tree.query(np.hstack([self.positions, -scaled_normals]))[1]
+        distance = np.linalg.norm(self.positions - self.positions[partner], axis=1)
         cosine = (self.normals * self.normals[partner]).sum(axis=1)
         is_wall = (
-            (cosine < OPPOSITE)
+            (cosine < MAX_OPPOSITE_COSINE)
             & (distance > 1e-5 * self.extent)
-            & (distance < WALL_REACH * self.extent)
+            & (distance < MAX_WALL_DISTANCE * self.extent)
         )
         position = np.flatnonzero(is_wall)
         return np.stack([position, partner[position]], axis=1)
@@ -115,11 +123,11 @@ class Body:
 # ---- modes over space
 
 
-body = lru_cache(maxsize=8)(Body)  # of a mesh; kept in memory
+get_welded_mesh = lru_cache(maxsize=8)(WeldedMesh)  # of a mesh; kept in memory
 
 
 @lru_cache(maxsize=8)
-def shape_modes(mesh: Mesh, count: int) -> Doubles:
+def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     """Return the smoothest displacement fields of a mesh that are no rigid motion.
 
     Kept in memory.
@@ -129,10 +137,10 @@ def shape_modes(mesh: Mesh, count: int) -> Doubles:
         count: number of fields.
 
     Returns:
-        (P, 3, count), for each position of `body(mesh)`, smoothest first; the largest
+        (P, 3, count), for each position of `get_welded_mesh(mesh)`, smoothest first; the largest
         length is 1 in each.
     """
-    welded_mesh = body(mesh)
+    welded_mesh = get_welded_mesh(mesh)
     points, cell = _landmarks(welded_mesh)
     n_scalars = min(math.ceil(count / 3) + 2, len(points) - 1)
     width = BANDWIDTH * cell
@@ -141,7 +149,7 @@ def shape_modes(mesh: Mesh, count: int) -> Doubles:
     combination = _without_rotation(points, functions, mass, energy, count)
 
     # Nystrom extension from the landmarks to all positions
-    exponent = -cdist(welded_mesh.places, points, "sqeuclidean") / (2.0 * width**2)
+    exponent = -cdist(welded_mesh.positions, points, "sqeuclidean") / (2.0 * width**2)
     weights = np.exp(exponent - exponent.max(axis=1, keepdims=True)) / density
     extended = (weights / weights.sum(axis=1, keepdims=True)) @ (
         functions / np.maximum(values, 0.05)
@@ -151,8 +159,8 @@ def shape_modes(mesh: Mesh, count: int) -> Doubles:
 
 
 def _diffusion_map(
-    points: Doubles, width: float, n_scalars: int
-) -> tuple[Doubles, Doubles, Doubles, Doubles]:
+    points: Float64Array, width: float, n_scalars: int
+) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
     """Compute the diffusion map of points (Coifman and Lafon 2006, alpha = 1).
 
     Args:
@@ -185,31 +193,31 @@ def _diffusion_map(
     return density, functions, mass, values[falling]
 
 
-def _signed(vectors: Doubles) -> Doubles:
+def _signed(vectors: Float64Array) -> Float64Array:
     """Return columns with the sign that makes their largest entry positive."""
     largest = vectors[np.abs(vectors).argmax(axis=0), np.arange(vectors.shape[1])]
     return np.asarray(vectors * np.where(largest < 0.0, -1.0, 1.0))
 
 
-def _landmarks(solid: Body) -> tuple[Doubles, float]:
+def _landmarks(solid: WeldedMesh) -> tuple[Float64Array, float]:
     """Return points (N, 3) spread evenly over the surface, and the side of their cells.
 
-    At most `LANDMARKS`: each is the mean of the samples in one cube.
+    At most `MAX_LANDMARKS`: each is the mean of the samples in one cube.
     """
-    corners = solid.places[solid.faces]
-    areas = np.linalg.norm(face_vectors(corners), axis=1)
+    corners = solid.positions[solid.faces]
+    areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
     generator = np.random.default_rng(0)
-    quantiles = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    quantiles = (np.arange(N_SURFACE_SAMPLES) + 0.5) / N_SURFACE_SAMPLES
     face = np.searchsorted(np.cumsum(areas) / areas.sum(), quantiles)
     face = face.clip(max=len(areas) - 1)
-    barycentric = generator.dirichlet((1.0, 1.0, 1.0), SAMPLES)
+    barycentric = generator.dirichlet((1.0, 1.0, 1.0), N_SURFACE_SAMPLES)
     samples = np.einsum("nk,nkc->nc", barycentric, corners[face])
-    pool = np.concatenate([samples, solid.places])
-    cell = CELL * solid.extent
+    pool = np.concatenate([samples, solid.positions])
+    cell = CELL_SIZE * solid.extent
     while True:
         cubes = np.floor((pool - pool.min(axis=0)) / cell).astype(np.int64)
         cube_of = np.unique(cubes, axis=0, return_inverse=True)[1].reshape(-1)
-        if int(cube_of.max()) + 1 <= LANDMARKS:
+        if int(cube_of.max()) + 1 <= MAX_LANDMARKS:
             break
         cell *= 1.15
     n_members = np.bincount(cube_of)
@@ -218,8 +226,12 @@ def _landmarks(solid: Body) -> tuple[Doubles, float]:
 
 
 def _without_rotation(
-    points: Doubles, functions: Doubles, mass: Doubles, energy: Doubles, count: int
-) -> Doubles:
+    points: Float64Array,
+    functions: Float64Array,
+    mass: Float64Array,
+    energy: Float64Array,
+    count: int,
+) -> Float64Array:
     """Combine scalar modes to vector fields that hold no rotation, smoothest first.
 
     Args:
@@ -254,16 +266,18 @@ class Preconditioner:
     Rigid motions are taken out.
     """
 
-    def __init__(self, solid: Body) -> None:
+    def __init__(self, welded_mesh: WeldedMesh) -> None:
         """Factorise the system, and compute the rigid motions."""
-        count = len(solid.places)
-        laplacian, mean_length = _wall_laplacian(solid)
-        strength = (SMOOTHING_LENGTH * solid.extent / mean_length) ** 2
+        count = len(welded_mesh.positions)
+        laplacian, mean_length = _wall_laplacian(welded_mesh)
+        strength = (SMOOTHING_LENGTH * welded_mesh.extent / mean_length) ** 2
         self._factor = sparse_linalg.splu(
             (sparse.identity(count) + strength * laplacian).tocsc()
         )
-        centered = solid.places - solid.places.mean(axis=0)
-        shifts = [np.broadcast_to(axis, solid.places.shape) for axis in np.eye(3)]
+        centered = welded_mesh.positions - welded_mesh.positions.mean(axis=0)
+        shifts = [
+            np.broadcast_to(axis, welded_mesh.positions.shape) for axis in np.eye(3)
+        ]
         turns = [np.cross(axis, centered) for axis in np.eye(3)]
         motions = np.stack([field.reshape(-1) for field in (*shifts, *turns)], axis=1)
         self._rigid = torch.from_numpy(np.asarray(linalg.orth(motions)))
@@ -277,18 +291,18 @@ class Preconditioner:
         return (flat - rigid @ (rigid.T @ flat)).reshape(smooth.shape)
 
 
-def _wall_laplacian(solid: Body) -> tuple[Any, float]:
+def _wall_laplacian(solid: WeldedMesh) -> tuple[Any, float]:
     """Return the Laplacian (P, P) of a mesh with links through its walls, sparse.
 
     Edges are weighted by the inverse square of their length. The second value is the
     mean length of an edge.
     """
-    count = len(solid.places)
+    count = len(solid.positions)
     edges = np.concatenate(
         [solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]]
     )
     edges = np.unique(np.sort(edges, axis=1), axis=0)
-    edge_vectors = solid.places[edges[:, 0]] - solid.places[edges[:, 1]]
+    edge_vectors = solid.positions[edges[:, 0]] - solid.positions[edges[:, 1]]
     lengths = np.linalg.norm(edge_vectors, axis=1)
     mean_length = float(lengths.mean())
     edge_weights = (mean_length / lengths.clip(0.1 * mean_length)) ** 2
@@ -323,45 +337,48 @@ class _Solve(torch.autograd.Function):
 # ---- how far
 
 
-class Limits:
+class DisplacementLimits:
     """Holds displacements where the mesh stays whole, by one factor for all of it.
 
         offsets = epsilon s d,    s = (1 + sum_i r_i^p)^(-1/p)
 
     with `r_i` what each bound would be used up to, 1 being all of it: the length of d
-    at each place (1), the gradient of the displacement along each face (`FACE_STRAIN`),
-    and between the two sides of each wall (`WALL_STRAIN`). As `s max r < 1`, no place
+    at each place (1), the gradient of the displacement along each face (`MAX_FACE_STRAIN`),
+    and between the two sides of each wall (`MAX_WALL_STRAIN`). As `s max r < 1`, no place
     moves further than epsilon, no face turns over (its tangent map is I + B with ||B||
     < 1, and so has a positive determinant), and walls and gaps between places keep more
     than half their width. Epsilon is in the mesh's units.
     """
 
-    def __init__(self, solid: Body, epsilon: float) -> None:
+    def __init__(self, welded_mesh: WeldedMesh, epsilon: float) -> None:
         """Compute what each bound needs of the mesh."""
         self.epsilon = epsilon
-        corners = solid.places[solid.faces]
+        corners = welded_mesh.positions[welded_mesh.faces]
         first = corners[:, 1] - corners[:, 0]
         second = corners[:, 2] - corners[:, 0]
         edges = np.stack([first, second, first - second])
         longest = np.linalg.norm(edges, axis=-1).max(axis=0)
         double_area = np.linalg.norm(np.cross(first, second), axis=1)
-        is_sound = double_area > THIN_FACE * longest**2
+        is_sound = double_area > MIN_FACE_HEIGHT * longest**2
         first = first[is_sound]
         second = second[is_sound]
         double_area = double_area[is_sound]
         length = np.linalg.norm(first, axis=1)
         along_first = (first * second).sum(axis=1) / length
         # gradient along the face's two axes: [d1 d2] [[length, along], [0, height]]^-1
-        self._faces = torch.from_numpy(solid.faces[is_sound])
+        self._faces = torch.from_numpy(welded_mesh.faces[is_sound])
         self._inverse_axes = torch.from_numpy(
             np.stack([1.0 / length, along_first / length, length / double_area], axis=1)
         )
-        self._walls = torch.from_numpy(solid.walls)
-        wall_vectors = solid.places[solid.walls[:, 0]] - solid.places[solid.walls[:, 1]]
+        self._walls = torch.from_numpy(welded_mesh.walls)
+        wall_vectors = (
+            welded_mesh.positions[welded_mesh.walls[:, 0]]
+            - welded_mesh.positions[welded_mesh.walls[:, 1]]
+        )
         self._wall_widths = torch.from_numpy(np.linalg.norm(wall_vectors, axis=1))
-        self._positions = torch.from_numpy(solid.places)
+        self._positions = torch.from_numpy(welded_mesh.positions)
 
-    def used(self, field: Tensor) -> Tensor:
+    def compute_squared_usage(self, field: Tensor) -> Tensor:
         """Return how far `epsilon d` uses each bound up, squared.
 
         Args:
@@ -382,27 +399,27 @@ class Limits:
         gradient_1 = first * inverse_axes[:, :1]
         gradient_2 = (second - first * inverse_axes[:, 1:2]) * inverse_axes[:, 2:]
         of_faces = (gradient_1.square() + gradient_2.square()).sum(dim=1) * (
-            self.epsilon / FACE_STRAIN
+            self.epsilon / MAX_FACE_STRAIN
         ) ** 2
         difference = field.index_select(0, walls[:, 0]) - field.index_select(
             0, walls[:, 1]
         )
         of_walls = (
             difference.square().sum(dim=1)
-            * (self.epsilon / WALL_STRAIN / wall_widths).square()
+            * (self.epsilon / MAX_WALL_STRAIN / wall_widths).square()
         )
         return torch.cat([field.square().sum(dim=1), of_faces, of_walls])
 
-    def held(self, field: Tensor) -> Tensor:
+    def limit(self, field: Tensor) -> Tensor:
         """Return the offsets (P, 3) for a field d (P, 3), float64; differentiable."""
-        squares = self.used(field)
+        squares = self.compute_squared_usage(field)
         # keeps the power within the range of floats
         largest = squares.detach().max().clamp_min(1.0)
-        powers = (squares / largest).pow(SHARPNESS // 2).sum()
-        total = powers + largest ** (-SHARPNESS // 2)
-        return self.epsilon * field * (total ** (-1.0 / SHARPNESS) / largest.sqrt())
+        powers = (squares / largest).pow(NORM_EXPONENT // 2).sum()
+        total = powers + largest ** (-NORM_EXPONENT // 2)
+        return self.epsilon * field * (total ** (-1.0 / NORM_EXPONENT) / largest.sqrt())
 
-    def thinnest(self, offsets: Tensor) -> float:
+    def find_thinnest_wall(self, offsets: Tensor) -> float:
         """Return the smallest width of a wall or gap after a displacement (P, 3).
 
         It is a fraction of the width before.
@@ -416,10 +433,10 @@ class Limits:
 
 FORMS = ("modes", "large-steps")
 DEFAULT_EPSILON = 0.03
-LARGEST_EPSILON = 0.5
+MAX_EPSILON = 0.5
 DEFAULT_MODES = 24
-LARGEST_MODES = 200
-PUSH = 4.0
+MAX_MODES = 200
+PUSH_FACTOR = 4.0
 """Factor on the pushes of form large-steps: pushes at their largest over a
 neighbourhood pass the bound on the length of d, so that it is reached without every
 vertex of the object agreeing.
@@ -464,13 +481,13 @@ class GeometryControl(Control):
             DEFAULT_EPSILON,
             "Largest displacement of a vertex, in object sizes.",
             "epsilon",
-            most=LARGEST_EPSILON,
+            most=MAX_EPSILON,
         ),
         Choice(
             "modes",
             DEFAULT_MODES,
             "Number of smooth modes (form modes).",
-            whole=(1, LARGEST_MODES),
+            whole=(1, MAX_MODES),
         ),
         Choice(
             "form",
@@ -481,56 +498,62 @@ class GeometryControl(Control):
     )
 
     def check_choices(self) -> None:
-        self.form = self.chosen_form(FORMS)
+        self.form = self.select_form(FORMS)
 
     def fit(self) -> None:
         """Compute the modes, or the preconditioner, of the mesh in the scene."""
         self._offsets_input = f"{self.mesh}.offsets"
-        self._mesh = self.mesh_in(self.scene).mesh
-        solid = body(self._mesh)
-        self._index = torch.from_numpy(solid.index)
-        self._limits = Limits(solid, float(self.chosen["epsilon"]))
+        self._mesh = self.get_mesh(self.scene).mesh
+        solid = get_welded_mesh(self._mesh)
+        self._index = torch.from_numpy(solid.position_of_vertex)
+        self._limits = DisplacementLimits(solid, float(self.chosen["epsilon"]))
         if self.form == "modes":
-            modes = torch.from_numpy(shape_modes(self._mesh, int(self.chosen["modes"])))
+            modes = torch.from_numpy(
+                compute_shape_modes(self._mesh, int(self.chosen["modes"]))
+            )
             group = Group("amplitudes", modes.shape[2], ESTIMATORS)
             self._field: Callable[[Tensor], Tensor] = lambda a: modes.to(a.device) @ a
         else:
             precondition = Preconditioner(solid)
-            group = Group("pushes", 3 * len(solid.places), ESTIMATORS)
-            self._field = lambda a: PUSH * precondition(a.reshape(-1, 3))
+            group = Group("pushes", 3 * len(solid.positions), ESTIMATORS)
+            self._field = lambda a: PUSH_FACTOR * precondition(a.reshape(-1, 3))
         self.groups = (group,)
         self.start = torch.full((group.size,), 0.5)
 
     def inputs(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         """Return the offset of each vertex, (V, 3)."""
-        offsets = self.offsets(u).index_select(0, self._index.to(u.device))
+        offsets = self.compute_offsets(u).index_select(0, self._index.to(u.device))
         return {self._offsets_input: offsets.float()}
 
-    def offsets(self, u: Tensor) -> Tensor:
+    def compute_offsets(self, u: Tensor) -> Tensor:
         """Return the displacement of each position, (P, 3) float64."""
-        return self._limits.held(self._field(2.0 * u.double() - 1.0))
+        return self._limits.limit(self._field(2.0 * u.double() - 1.0))
 
     def describe(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         """Return how far vertices move, and how much the thinnest wall has lost."""
-        offsets = self.offsets(u.detach())
+        offsets = self.compute_offsets(u.detach())
         lengths = offsets.norm(dim=1)
         return {
-            f"{self.name}.largest": measure(lengths.max(), "object sizes"),
-            f"{self.name}.rms": measure(lengths.square().mean().sqrt(), "object sizes"),
-            f"{self.name}.thinnest": measure(self._limits.thinnest(offsets), "1"),
+            f"{self.name}.largest": make_value(lengths.max(), "object sizes"),
+            f"{self.name}.rms": make_value(
+                lengths.square().mean().sqrt(), "object sizes"
+            ),
+            f"{self.name}.thinnest": make_value(
+                self._limits.find_thinnest_wall(offsets), "1"
+            ),
         }
 
-    def files(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+    def get_artifact_files(
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, bytes]:
         """Return the displaced mesh as an OBJ file."""
         moving = MovingMesh(self._mesh, np.eye(4))
         offsets = self.inputs(u.detach())[self._offsets_input]
-        vertices, normals = moving.place(None, offsets)
+        vertices, normals = moving.transform_mesh(None, offsets)
         lines = ["# advsearch: z is up; texture coordinates as of the original object"]
         lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices.tolist()]
         lines += [f"vt {u:.7g} {v:.7g}" for u, v in self._mesh.uvs.tolist()]

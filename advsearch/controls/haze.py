@@ -28,9 +28,11 @@ from advsearch.extend import (
 )
 
 # the haze reaches at least this far from the scene's middle, object sizes
-LEAST_RADIUS = 4.0
-BEHIND_CAMERA = 1.5  # it reaches at least so many times as far as the camera is away
-THIN_HAZE = 0.1  # density where it is not searched and was not given
+MIN_RADIUS = 4.0
+CAMERA_DISTANCE_FACTOR = (
+    1.5  # it reaches at least so many times as far as the camera is away
+)
+DEFAULT_DENSITY = 0.1  # density where it is not searched and was not given
 
 
 class HazeControl(Control):
@@ -55,7 +57,7 @@ class HazeControl(Control):
         ),
     )
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with the value of the scene's own haze, if it has one."""
         scene_haze = _find_haze(self.scene)
         default = parameter.default
@@ -70,8 +72,8 @@ class HazeControl(Control):
             )
         if scene_haze is not None:
             default = scene_haze.density
-        elif self.asked and not self.searches("density"):
-            default = THIN_HAZE
+        elif self.has_requested_search and not self.is_searched("density"):
+            default = DEFAULT_DENSITY
         spec = self.specs.get("density")
         has_adjoint = isinstance(spec, Range) and spec.low > 0.0
         return replace(
@@ -80,7 +82,7 @@ class HazeControl(Control):
             estimators=Parameter.LIT if has_adjoint else ("differences",),
         )
 
-    def unchanged(self, parameter: Parameter) -> float | str:
+    def get_scene_value(self, parameter: Parameter) -> float | str:
         # of the density; see `amount`
         return 0.0 if _find_haze(self.scene) is None else parameter.default
 
@@ -97,7 +99,7 @@ class HazeControl(Control):
         camera_distance = float(np.linalg.norm(geometry.camera_to_world(scene)[:3, 3]))
         return scene.with_part(
             parts.HazePart(
-                self.name, max(LEAST_RADIUS, BEHIND_CAMERA * camera_distance)
+                self.name, max(MIN_RADIUS, CAMERA_DISTANCE_FACTOR * camera_distance)
             )
         )
 

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from advsearch.extend import Choice, Control, OneOf, Parameter, Values, color
 
-DOTS = 4  # how many dots there are when nothing is said
-MOST_DOTS = 64
-PLACES = ("x", "y")
+DEFAULT_DOTS = 4  # how many dots there are when nothing is said
+MAX_DOTS = 64
+POSITION_PARAMETERS = ("x", "y")
 # side in pixels of the picture of the sticker that is kept with a run
 STICKER_SIDE = 256
 # past this exponent a dot counts as invisible: exp(-40) is 4e-18, and no power
@@ -98,33 +98,35 @@ class LensControl(Control):
     choices = (
         Choice(
             "dots",
-            DOTS,
-            f"How many dots there are, 1 to {MOST_DOTS}.",
-            whole=(1, MOST_DOTS),
+            DEFAULT_DOTS,
+            f"How many dots there are, 1 to {MAX_DOTS}.",
+            whole=(1, MAX_DOTS),
         ),
     )
 
     @property
-    def dots(self) -> int:
+    def n_dots(self) -> int:
         """How many dots there are."""
         return int(self.chosen["dots"])
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
-        return replace(parameter, shape=(self.dots,)) if parameter.shape else parameter
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
+        return (
+            replace(parameter, shape=(self.n_dots,)) if parameter.shape else parameter
+        )
 
     def fit(self) -> None:
         """Spread the dots over the image at the start."""
         super().fit()
-        positions = spread(self.dots)
+        positions = spread_positions(self.n_dots)
         for slot in self.slots:
             name = slot.parameter.name
-            is_range = slot.width > 0 and not isinstance(slot.spec, OneOf)
-            if name in PLACES and is_range:
-                coordinates = slice(slot.begin, slot.begin + slot.width)
-                self.start[coordinates] = positions[PLACES.index(name)]
+            is_range = slot.n_coordinates > 0 and not isinstance(slot.spec, OneOf)
+            if name in POSITION_PARAMETERS and is_range:
+                coordinates = slice(slot.offset, slot.offset + slot.n_coordinates)
+                self.start[coordinates] = positions[POSITION_PARAMETERS.index(name)]
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
-        return with_dots(image, self._spread_dots(values))
+        return draw_dots(image, self._spread_dots(values))
 
     def kept_pictures(
         self, values: Values, so_far: Mapping[str, Tensor]
@@ -133,18 +135,20 @@ class LensControl(Control):
         square = torch.arange(STICKER_SIDE) // (STICKER_SIDE // 16)
         is_dark = (square[:, None] + square[None, :]) % 2
         checkerboard = (0.6 - 0.2 * is_dark)[..., None].repeat(1, 1, 3)
-        return {self.name: with_dots(checkerboard, self._spread_dots(values))}
+        return {self.name: draw_dots(checkerboard, self._spread_dots(values))}
 
     def _spread_dots(self, values: Values) -> dict[str, Tensor]:
         """Return the values, with the dots spread along an axis that was not set."""
         spread_values = dict(values)
-        for axis, name in enumerate(PLACES):
-            if self.asked and name not in self.specs:
-                spread_values[name] = spread(self.dots)[axis].to(values[name].device)
+        for axis, name in enumerate(POSITION_PARAMETERS):
+            if self.has_requested_search and name not in self.specs:
+                spread_values[name] = spread_positions(self.n_dots)[axis].to(
+                    values[name].device
+                )
         return spread_values
 
 
-def spread(count: int) -> Tensor:
+def spread_positions(count: int) -> Tensor:
     """Return positions spread evenly over the middle 80 % of the image.
 
     They are a lattice with the two irrational steps of the plastic number, a
@@ -160,7 +164,7 @@ def spread(count: int) -> Tensor:
     return (0.1 + 0.8 * lattice).float()
 
 
-def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+def draw_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
     """Return an image as it is seen through a lens with dots on it.
 
     Args:
@@ -182,7 +186,7 @@ def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
 
 
 def _compute_covers(height: int, width: int, values: Mapping[str, Tensor]) -> Tensor:
-    """Return the opacity (dots, H, W) of each dot in each pixel; see `with_dots`."""
+    """Return the opacity (dots, H, W) of each dot in each pixel; see `draw_dots`."""
     shorter_side = min(height, width)
     device = values["x"].device
     column = torch.arange(width, device=device) + 0.5

@@ -23,29 +23,29 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Choice, Control, Values
-from advsearch.controls.ranges import Fixed, Number
+from advsearch.controls.ranges import Fixed, ParameterValue
 from advsearch.errors import InputError
 from advsearch.scene import color
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import WHITE, metered_gain
-from advsearch.scene.geometry import affine
+from advsearch.scene.formation import CARD_REFLECTANCE, compute_metered_gain
+from advsearch.scene.geometry import make_affine
 from advsearch.scene.parts import BallLamp, PointLamp
 from advsearch.scene.settings import Parameter
 
 # linear display value of a white surface that faces a lamp of power 1 at distance 1
 LIT_WHITE = 0.9
-LIT_POWER = 6.0
+DEFAULT_POWER = 6.0
 """Power of a lamp whose power is not searched and was not given: at its default place
 about as bright as the environment.
 """
 
 
-def metered_irradiance(scene: SceneDescription) -> float:
+def compute_metered_irradiance(scene: SceneDescription) -> float:
     """Return the irradiance that gives a white surface `LIT_WHITE`, in scene units.
 
     At the scene's metered gain.
     """
-    return LIT_WHITE * math.pi / (WHITE * metered_gain(scene))
+    return LIT_WHITE * math.pi / (CARD_REFLECTANCE * compute_metered_gain(scene))
 
 
 def _make_coordinate(
@@ -111,21 +111,25 @@ class LightControl(Control):
     )
 
     def check_choices(self) -> None:
-        if self.chosen["type"] == "point" and "size" in self._given:
+        if self.chosen["type"] == "point" and "size" in self._settings:
             raise InputError(
                 f"{self.name}.size: expected none for a point light, got "
-                f"{self._given['size']!r}; leave it out, or set "
+                f"{self._settings['size']!r}; leave it out, or set "
                 f"{self.name}.type to area"
             )
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
-        if parameter.name == "power" and self.asked and not self.searches("power"):
-            return replace(parameter, default=LIT_POWER)
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
+        if (
+            parameter.name == "power"
+            and self.has_requested_search
+            and not self.is_searched("power")
+        ):
+            return replace(parameter, default=DEFAULT_POWER)
         if parameter.name == "size" and self.chosen["type"] == "point":
             return replace(parameter, search=None)
         return parameter
 
-    def unchanged(self, parameter: Parameter) -> Number:
+    def get_scene_value(self, parameter: Parameter) -> ParameterValue:
         return 0.0  # of the power; see `amount`
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
@@ -143,7 +147,7 @@ class LightControl(Control):
         intensity = (
             color.combine_channels(values)
             * values["power"]
-            * metered_irradiance(self.scene)
+            * compute_metered_irradiance(self.scene)
         )
         if self.chosen["type"] == "point":
             return {
@@ -152,11 +156,11 @@ class LightControl(Control):
             }
         radius = values["size"] / 2.0
         return {
-            f"{self.name}.ball": ball(position, radius),
+            f"{self.name}.ball": make_ball_pose(position, radius),
             f"{self.name}.radiance": intensity / (math.pi * radius**2),
         }
 
 
-def ball(place: Tensor, radius: Tensor) -> Tensor:
+def make_ball_pose(center: Tensor, radius: Tensor) -> Tensor:
     """Return the pose (4, 4) of the unit ball at a place (3,) with a radius ()."""
-    return affine(torch.eye(3).to(place) * radius, place)
+    return make_affine(torch.eye(3).to(center) * radius, center)

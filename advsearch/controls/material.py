@@ -21,13 +21,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from advsearch.controls.base import Control, Values
-from advsearch.controls.ranges import Number
+from advsearch.controls.ranges import ParameterValue
 from advsearch.errors import InputError
 from advsearch.scene import color
-from advsearch.scene.assets import Doubles, Floats, Material, Mesh
+from advsearch.scene.assets import Float32Array, Float64Array, Material, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.raster import looked_up, rasterised
+from advsearch.scene.raster import look_up_texture, rasterize_charts
 from advsearch.scene.settings import CHANNELS, MATERIAL, Parameter
 
 # --------------------------------------------------------------------------------------
@@ -38,15 +38,15 @@ from advsearch.scene.settings import CHANNELS, MATERIAL, Parameter
 # arXiv 2106.03805, section 4), made of periodic gradient noise (Perlin 1985), cells
 # (Worley 1996), and iterated band-pass filtering (Turing 1952; Young 1984).
 
-Grid = tuple[Doubles, Doubles]
+Grid = tuple[Float64Array, Float64Array]
 """Coordinates x (to the right) and y (down) of texel centres, each (SIDE, SIDE) in (0,
 1).
 """
 
-SIDE = 512  # side of a tile in texels
+TILE_SIDE = 512  # side of a tile in texels
 # power of the normal's components that weighs the three projections of a tile: how
 # sharply they meet
-BLEND = 20.0
+BLEND_EXPONENT = 20.0
 
 
 @dataclass(frozen=True)
@@ -61,18 +61,18 @@ class Pattern:
     name: str
     size: float
     material: Material
-    paint: Callable[[Grid], Doubles]
+    paint: Callable[[Grid], Float64Array]
 
 
 PATTERNS: dict[str, Pattern] = {}  # every named material by its name
 
 
-def pattern(
+def register_pattern(
     size: float, **surface: float
-) -> Callable[[Callable[[Grid], Doubles]], None]:
+) -> Callable[[Callable[[Grid], Float64Array]], None]:
     """Make a named material of the function below; see `Pattern`."""
 
-    def register(paint: Callable[[Grid], Doubles]) -> None:
+    def register(paint: Callable[[Grid], Float64Array]) -> None:
         PATTERNS[paint.__name__] = Pattern(
             paint.__name__, size, Material(**surface), paint
         )
@@ -83,7 +83,7 @@ def pattern(
 # ---- ingredients: everything repeats after 1 in x and y
 
 
-def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Doubles:
+def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
     """Return gradient noise with whole lattice cells across the tile.
 
     About -1 to 1, mean 0 (Perlin 1985).
@@ -98,7 +98,7 @@ def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Doubles:
     column = left.astype(np.int64)
     row = top.astype(np.int64)
 
-    def corner(right: int, below: int) -> Doubles:
+    def corner(right: int, below: int) -> Float64Array:
         turn = angle[(row + below) % rows, (column + right) % columns]
         return np.asarray(np.cos(turn) * (x - right) + np.sin(turn) * (y - below))
 
@@ -109,13 +109,15 @@ def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Doubles:
     return np.asarray((upper * (1.0 - y_weight) + lower * y_weight) * 1.5)
 
 
-def _fade(position: Doubles) -> Doubles:
+def _fade(position: Float64Array) -> Float64Array:
     """Return the weight of the further corner at a position in a lattice cell."""
     cubed = position * position * position
     return np.asarray(cubed * (position * (position * 6.0 - 15.0) + 10.0))
 
 
-def _clouds(grid: Grid, cells: tuple[int, int], octaves: int, seed: int) -> Doubles:
+def _clouds(
+    grid: Grid, cells: tuple[int, int], octaves: int, seed: int
+) -> Float64Array:
     """Return octaves of noise, each twice as fine and half as strong; about -1 to 1."""
     total = np.zeros_like(grid[0])
     for octave in range(octaves):
@@ -132,7 +134,7 @@ def _warped(grid: Grid, cells: int, amount: float, seed: int) -> Grid:
     return grid[0] + amount * right, grid[1] + amount * down
 
 
-def _scattered(count: int, seed: int) -> Doubles:
+def _scattered(count: int, seed: int) -> Float64Array:
     """Return irregular points of a torus, far from each other: (count, 2) in [0, 1).
 
     Best candidate sampling (Mitchell 1991): each point is the farthest from those
@@ -151,8 +153,8 @@ def _scattered(count: int, seed: int) -> Doubles:
 
 
 def _cells(
-    grid: Grid, points: Doubles, count: int = 2
-) -> tuple[Doubles, npt.NDArray[np.int64]]:
+    grid: Grid, points: Float64Array, count: int = 2
+) -> tuple[Float64Array, npt.NDArray[np.int64]]:
     """Return the nearest points on the torus, nearest first.
 
     Returns:
@@ -167,7 +169,7 @@ def _cells(
 
 def _turing(
     wavelength: tuple[float, float], bias: float, seed: int, rounds: int = 12
-) -> Doubles:
+) -> Float64Array:
     """Return animal stripes or spots in [-1, 1].
 
     Noise, band-passed and saturated again and again; after about ten rounds the pattern
@@ -181,29 +183,33 @@ def _turing(
         seed: of the noise.
         rounds: number of steps.
     """
-    frequency = np.fft.fftfreq(SIDE, 1.0 / SIDE)
+    frequency = np.fft.fftfreq(TILE_SIDE, 1.0 / TILE_SIDE)
     radius = np.hypot(
         frequency[None, :] * wavelength[0], frequency[:, None] * wavelength[1]
     )
     band = np.exp(-(((radius - 1.0) / 0.22) ** 2))
-    field = np.random.Generator(np.random.PCG64(seed)).standard_normal((SIDE, SIDE))
+    field = np.random.Generator(np.random.PCG64(seed)).standard_normal(
+        (TILE_SIDE, TILE_SIDE)
+    )
     for _ in range(rounds):
         field = np.fft.ifft2(np.fft.fft2(field) * band).real
         field = np.tanh(2.5 * field / field.std() + bias)
     return np.asarray(field)
 
 
-def _step(value: Doubles, edge: float, soft: float) -> Doubles:
+def _step(value: Float64Array, edge: float, soft: float) -> Float64Array:
     """Return 0 below the edge and 1 above it, with a smooth ramp `soft` wide."""
     fraction = np.clip((value - edge) / soft + 0.5, 0.0, 1.0)
     return np.asarray(fraction * fraction * (3.0 - 2.0 * fraction))
 
 
-def _color(code: str) -> Doubles:
+def _color(code: str) -> Float64Array:
     return np.array([int(code[i : i + 2], 16) / 255.0 for i in (0, 2, 4)])
 
 
-def _mix(first: Doubles, second: Doubles, fraction: Doubles) -> Doubles:
+def _mix(
+    first: Float64Array, second: Float64Array, fraction: Float64Array
+) -> Float64Array:
     """Interpolate from the first color to the second.
 
     Colors are (3,) or (SIDE, SIDE, 3), fractions (SIDE, SIDE).
@@ -211,7 +217,7 @@ def _mix(first: Doubles, second: Doubles, fraction: Doubles) -> Doubles:
     return np.asarray(first + (second - first) * fraction[..., None])
 
 
-def _ramp(value: Doubles, *codes: str) -> Doubles:
+def _ramp(value: Float64Array, *codes: str) -> Float64Array:
     """Interpolate colors that are evenly spaced over values from 0 to 1."""
     colors = np.stack([_color(code) for code in codes])
     stops = np.linspace(0.0, 1.0, len(codes))
@@ -223,13 +229,13 @@ def _ramp(value: Doubles, *codes: str) -> Doubles:
 # ---- the patterns
 
 
-@pattern(1.0, roughness=0.5)
-def plain(grid: Grid) -> Doubles:
-    return np.ones((SIDE, SIDE, 3))
+@register_pattern(1.0, roughness=0.5)
+def plain(grid: Grid) -> Float64Array:
+    return np.ones((TILE_SIDE, TILE_SIDE, 3))
 
 
-@pattern(0.6, roughness=0.45)
-def wood(grid: Grid) -> Doubles:
+@register_pattern(0.6, roughness=0.45)
+def wood(grid: Grid) -> Float64Array:
     """Paint year rings with fibres and pores."""
     x, y = grid
     bend = 0.16 * _clouds(grid, (2, 1), 2, 11) + 0.012 * _noise(grid, (8, 3), 12)
@@ -249,14 +255,14 @@ def wood(grid: Grid) -> Doubles:
     )
 
 
-@pattern(0.9, roughness=0.15)
-def marble(grid: Grid) -> Doubles:
+@register_pattern(0.9, roughness=0.15)
+def marble(grid: Grid) -> Float64Array:
     """Paint clouds with dark veins."""
     warped = _warped(grid, 2, 0.22, 21)
     finely_warped = _warped(warped, 6, 0.03, 22)
     x, y = finely_warped
     clouds = 0.5 + 0.5 * _clouds(warped, (3, 3), 4, 25)
-    veins = np.zeros((SIDE, SIDE))
+    veins = np.zeros((TILE_SIDE, TILE_SIDE))
     for n_right, n_down, width, depth, seed in (
         (1, 1, 0.05, 0.75, 23),
         (2, 1, 0.02, 0.45, 24),
@@ -282,8 +288,8 @@ def marble(grid: Grid) -> Doubles:
     return _mix(base, _color("4c5159"), np.clip(veins, 0.0, 0.9))
 
 
-@pattern(0.6, roughness=0.9, specular=0.2)
-def brick(grid: Grid) -> Doubles:
+@register_pattern(0.6, roughness=0.9, specular=0.2)
+def brick(grid: Grid) -> Float64Array:
     """Paint a wall of bricks with mortar."""
     x, y = _warped(grid, 12, 0.0035, 31)
     rows = 8
@@ -312,8 +318,8 @@ def brick(grid: Grid) -> Doubles:
     return _mix(mortar, brick_color, solid)
 
 
-@pattern(0.45, roughness=0.95, specular=0.1)
-def fabric(grid: Grid) -> Doubles:
+@register_pattern(0.45, roughness=0.95, specular=0.1)
+def fabric(grid: Grid) -> Float64Array:
     """Paint a plain weave of two threads."""
     x, y = _warped(grid, 6, 0.004, 41)
     count = 16
@@ -341,15 +347,15 @@ def fabric(grid: Grid) -> Doubles:
 
 
 def _thread_tones(
-    generator: np.random.Generator, position: Doubles, count: int
-) -> Doubles:
+    generator: np.random.Generator, position: Float64Array, count: int
+) -> Float64Array:
     """Return the random tone (SIDE, SIDE, 1) of the thread that each texel is in."""
     tone = generator.uniform(0.8, 1.1, count)
     return np.asarray(tone[np.floor(position).astype(np.int64) % count][..., None])
 
 
-@pattern(0.7, roughness=0.8, specular=0.2)
-def leopard(grid: Grid) -> Doubles:
+@register_pattern(0.7, roughness=0.8, specular=0.2)
+def leopard(grid: Grid) -> Float64Array:
     """Paint rosettes with dots between them."""
     warped = _warped(_warped(grid, 4, 0.03, 51), 12, 0.012, 52)
     points = _scattered(42, 53)
@@ -361,14 +367,17 @@ def leopard(grid: Grid) -> Doubles:
     coat = _mix(coat, _color("a9692f"), 0.75 * core)
     dot_distance, _ = _cells(warped, _scattered(150, 57), 1)
     between_rosettes = _step(distance[..., 0], 0.07, 0.012)
-    dots = 1.0 - _step(dot_distance.reshape(SIDE, SIDE), 0.011, 0.006)
+    dots = 1.0 - _step(dot_distance.reshape(TILE_SIDE, TILE_SIDE), 0.011, 0.006)
     spots = np.clip(rosettes + dots * between_rosettes, 0.0, 1.0)
     return _mix(coat * (1.0 + 0.10 * fur)[..., None], _color("221710"), spots)
 
 
 def _draw_rosettes(
-    grid: Grid, points: Doubles, distance: Doubles, index: npt.NDArray[np.int64]
-) -> tuple[Doubles, Doubles]:
+    grid: Grid,
+    points: Float64Array,
+    distance: Float64Array,
+    index: npt.NDArray[np.int64],
+) -> tuple[Float64Array, Float64Array]:
     """Draw broken rings around points, and their darker cores; each (SIDE, SIDE).
 
     Args:
@@ -390,23 +399,23 @@ def _draw_rosettes(
     return ring * _step(waves, -0.75, 0.5), 1.0 - _step(radius, 0.042, 0.02)
 
 
-@pattern(0.8, roughness=0.8, specular=0.2)
-def zebra(grid: Grid) -> Doubles:
+@register_pattern(0.8, roughness=0.8, specular=0.2)
+def zebra(grid: Grid) -> Float64Array:
     stripes = _turing((0.42, 0.125), 0.0, 61)
     black = _step(stripes + 0.12 * _noise(grid, (10, 40), 62), 0.0, 0.7)
     fur = 1.0 + 0.06 * _clouds(grid, (30, 110), 2, 63)
     return _mix(_color("efeae0"), _color("17140f"), black) * fur[..., None]
 
 
-@pattern(0.5, roughness=0.4)
-def checker(grid: Grid) -> Doubles:
+@register_pattern(0.5, roughness=0.4)
+def checker(grid: Grid) -> Float64Array:
     x, y = grid
     odd = (np.floor(4.0 * x) + np.floor(4.0 * y)) % 2.0
     return _mix(_color("f2f2f0"), _color("191919"), odd)
 
 
-@pattern(0.7, roughness=0.85, metallic=0.1, specular=0.3)
-def rust(grid: Grid) -> Doubles:
+@register_pattern(0.7, roughness=0.85, metallic=0.1, specular=0.3)
+def rust(grid: Grid) -> Float64Array:
     """Paint rust under flakes of paint."""
     warped = _warped(grid, 4, 0.06, 71)
     broad = 0.5 + 0.5 * _clouds(warped, (3, 3), 5, 72)
@@ -431,8 +440,8 @@ def rust(grid: Grid) -> Doubles:
     return _mix(surface, _color("1b0d09"), 0.6 * pits)
 
 
-@pattern(0.5, roughness=0.9, specular=0.1)
-def grass(grid: Grid) -> Doubles:
+@register_pattern(0.5, roughness=0.9, specular=0.1)
+def grass(grid: Grid) -> Float64Array:
     """Paint blades over each other, bent and lighter towards the tip.
 
     Later ones lie on top.
@@ -458,23 +467,25 @@ def grass(grid: Grid) -> Doubles:
     return _draw_points(x.reshape(-1), y.reshape(-1), colors.reshape(-1, 3))
 
 
-def _draw_points(x: Doubles, y: Doubles, colors: Doubles) -> Doubles:
+def _draw_points(
+    x: Float64Array, y: Float64Array, colors: Float64Array
+) -> Float64Array:
     """Draw points (N,) of a torus with colors (N, 3) on dark soil, the last on top."""
-    column = np.floor(x * SIDE).astype(np.int64) % SIDE
-    row = np.floor(y * SIDE).astype(np.int64) % SIDE
-    texels = np.broadcast_to(_color("14240b"), (SIDE * SIDE, 3)).copy()
-    topmost = np.full(SIDE * SIDE, -1)
-    np.maximum.at(topmost, row * SIDE + column, np.arange(len(x)))
+    column = np.floor(x * TILE_SIDE).astype(np.int64) % TILE_SIDE
+    row = np.floor(y * TILE_SIDE).astype(np.int64) % TILE_SIDE
+    texels = np.broadcast_to(_color("14240b"), (TILE_SIDE * TILE_SIDE, 3)).copy()
+    topmost = np.full(TILE_SIDE * TILE_SIDE, -1)
+    np.maximum.at(topmost, row * TILE_SIDE + column, np.arange(len(x)))
     is_covered = topmost >= 0
     texels[is_covered] = colors[topmost[is_covered]]
-    return np.asarray(texels.reshape(SIDE, SIDE, 3))
+    return np.asarray(texels.reshape(TILE_SIDE, TILE_SIDE, 3))
 
 
-@pattern(0.5, roughness=0.85, specular=0.2)
-def elephant(grid: Grid) -> Doubles:
+@register_pattern(0.5, roughness=0.85, specular=0.2)
+def elephant(grid: Grid) -> Float64Array:
     """Paint skin with folds."""
     warped = _warped(_warped(grid, 3, 0.05, 91), 14, 0.012, 92)
-    folds = np.zeros((SIDE, SIDE))
+    folds = np.zeros((TILE_SIDE, TILE_SIDE))
     for count, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
         points = _scattered(count, seed)
         distance, _ = _cells(warped, points)
@@ -490,8 +501,8 @@ def elephant(grid: Grid) -> Doubles:
     return _mix(hide, _color("342f2b"), np.clip(folds, 0.0, 0.9))
 
 
-@pattern(0.5, roughness=0.32, metallic=1.0)
-def steel(grid: Grid) -> Doubles:
+@register_pattern(0.5, roughness=0.32, metallic=1.0)
+def steel(grid: Grid) -> Float64Array:
     scratches = (
         _noise(grid, (3, 240), 101)
         + 0.6 * _noise(grid, (7, 120), 102)
@@ -502,12 +513,12 @@ def steel(grid: Grid) -> Doubles:
 
 
 @cache
-def tile(name: str) -> Floats:
+def make_tile(name: str) -> Float32Array:
     """Return one tile of a pattern.
 
     (SIDE, SIDE, 3) float32 display-referred sRGB in [0, 1]; do not change it.
     """
-    line = (np.arange(SIDE) + 0.5) / SIDE
+    line = (np.arange(TILE_SIDE) + 0.5) / TILE_SIDE
     x, y = np.meshgrid(line, line)
     painted = np.clip(PATTERNS[name].paint((x, y)), 0.0, 1.0).astype(np.float32)
     painted.setflags(write=False)
@@ -517,7 +528,7 @@ def tile(name: str) -> Floats:
 # ---- on an object
 
 
-def covering(mesh: Mesh, name: str, side: int = SIDE) -> Floats:
+def make_covering(mesh: Mesh, name: str, side: int = TILE_SIDE) -> Float32Array:
     """Return the texture that covers a mesh with a pattern at one scale.
 
     Every texel of the texture looks up the tile at its place on the object, seen along
@@ -535,27 +546,27 @@ def covering(mesh: Mesh, name: str, side: int = SIDE) -> Floats:
         (side, side, 3) float32 display-referred sRGB in [0, 1], row 0 at v = 1.
     """
     positions, normals = _texel_surface(mesh, side)
-    scale = SIDE / PATTERNS[name].size
-    weights = np.abs(normals) ** BLEND
+    scale = TILE_SIDE / PATTERNS[name].size
+    weights = np.abs(normals) ** BLEND_EXPONENT
     weights /= weights.sum(axis=-1, keepdims=True)
     texels = np.zeros((side, side, 3), dtype=np.float32)
     for axis, (right, up) in enumerate(((1, 2), (0, 2), (0, 1))):
-        projected = looked_up(
-            tile(name), positions[..., right] * scale, -positions[..., up] * scale
+        projected = look_up_texture(
+            make_tile(name), positions[..., right] * scale, -positions[..., up] * scale
         )
         texels += weights[..., axis : axis + 1] * projected
     return texels
 
 
 @lru_cache(maxsize=2)
-def _texel_surface(mesh: Mesh, side: int) -> tuple[Floats, Floats]:
+def _texel_surface(mesh: Mesh, side: int) -> tuple[Float32Array, Float32Array]:
     """Positions and normals (side, side, 3) behind the texels of a mesh."""
-    charts = rasterised(mesh, side)
-    return charts.positions(), charts.normals()
+    charts = rasterize_charts(mesh, side)
+    return charts.compute_positions(), charts.compute_normals()
 
 
-OWN = "own"
-NUMBERS = tuple(one.name for one in MATERIAL)
+OBJECT_SURFACE = "own"
+SURFACE_PARAMETERS = tuple(one.name for one in MATERIAL)
 
 
 class MaterialControl(Control):
@@ -566,8 +577,8 @@ class MaterialControl(Control):
     parameters = (
         Parameter.named(
             "which",
-            (OWN, *PATTERNS),
-            OWN,
+            (OBJECT_SURFACE, *PATTERNS),
+            OBJECT_SURFACE,
             "The object's own surface, or a named material in its place.",
             estimators=("differences",),
         ),
@@ -579,9 +590,9 @@ class MaterialControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Check that the mesh has a principled surface. Raises InputError."""
-        varied = [name for name in NUMBERS if self._is_set(name)]
-        if self.mesh_in(scene).surface is not None and (
-            varied or self._material_names != (OWN,)
+        varied = [name for name in SURFACE_PARAMETERS if self._is_set(name)]
+        if self.get_mesh(scene).surface is not None and (
+            varied or self._material_names != (OBJECT_SURFACE,)
         ):
             raise InputError(
                 f"`controls` {self.name}: the {self.mesh} has a surface of Mitsuba's "
@@ -591,19 +602,23 @@ class MaterialControl(Control):
             )
         return scene
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
-        if parameter.name not in NUMBERS:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
+        if parameter.name not in SURFACE_PARAMETERS:
             return parameter
         # the fixed or first material
-        first = OWN if OWN in self._material_names else str(self._material_names[0])
+        first = (
+            OBJECT_SURFACE
+            if OBJECT_SURFACE in self._material_names
+            else str(self._material_names[0])
+        )
         return replace(
             parameter, default=float(getattr(self._get_material(first), parameter.name))
         )
 
-    def unchanged(self, parameter: Parameter) -> Number:
-        is_requested = self.setting(parameter) in self.scene.given
+    def get_scene_value(self, parameter: Parameter) -> ParameterValue:
+        is_requested = self.setting_name(parameter) in self.scene.requested
         return (
-            self.scene.number(self.setting(parameter))
+            self.scene.number(self.setting_name(parameter))
             if is_requested
             else parameter.default
         )
@@ -616,22 +631,22 @@ class MaterialControl(Control):
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the numbers of the surface, and its tinted base color."""
-        which = (OWN, *PATTERNS)[int(values["which"])]
+        which = (OBJECT_SURFACE, *PATTERNS)[int(values["which"])]
         material = self._get_material(which)
         inputs: dict[str, Tensor] = {}
-        for name in NUMBERS:
+        for name in SURFACE_PARAMETERS:
             if self._is_set(name):
                 inputs[f"{self.mesh}.{name}"] = values[name].reshape(1)
-            elif self._material_names != (OWN,):
+            elif self._material_names != (OBJECT_SURFACE,):
                 inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor(
                     [float(getattr(material, name))]
                 )
         if self._changes_color():
-            mesh = self.mesh_in(self.scene)
+            mesh = self.get_mesh(self.scene)
             tint = color.combine_channels(values)
             # what the controls before made of the texture
             base = so_far.get(self._base_color)
-            if which != OWN:
+            if which != OBJECT_SURFACE:
                 base = _linear_covering(mesh.mesh, which)
             elif base is None:
                 base = srgb_to_linear(torch.from_numpy(mesh.base_color.copy()))
@@ -655,29 +670,29 @@ class MaterialControl(Control):
         return f"{self.mesh}.base_color"
 
     @property
-    def _material_names(self) -> tuple[Number, ...]:
-        return self.allowed("which", OWN)
+    def _material_names(self) -> tuple[ParameterValue, ...]:
+        return self.list_allowed_values("which", OBJECT_SURFACE)
 
     def _is_set(self, name: str) -> bool:
         """Return whether a parameter was set or is searched.
 
         Otherwise it is the named material's own.
         """
-        return name in self.specs or not self.asked
+        return name in self.specs or not self.has_requested_search
 
     def _changes_color(self) -> bool:
-        return self._material_names != (OWN,) or any(
+        return self._material_names != (OBJECT_SURFACE,) or any(
             self._is_set(name) for name in CHANNELS
         )
 
     def _get_material(self, which: str) -> Material:
         return (
-            self.mesh_in(self.scene).material
-            if which == OWN
+            self.get_mesh(self.scene).material
+            if which == OBJECT_SURFACE
             else PATTERNS[which].material
         )
 
 
 @lru_cache(maxsize=len(PATTERNS))
 def _linear_covering(mesh: Mesh, which: str) -> Tensor:
-    return srgb_to_linear(torch.from_numpy(covering(mesh, which)))
+    return srgb_to_linear(torch.from_numpy(make_covering(mesh, which)))

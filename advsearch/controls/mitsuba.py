@@ -37,25 +37,27 @@ class MitsubaControl(Control):
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
-        if not self._given:
+        if not self._settings:
             raise InputError(
                 f"`controls` {self.name}: expected Mitsuba's names, as in "
                 "mitsuba:KEY=[low, high]"
             )
 
     @classmethod
-    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+    def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         return tuple(_make_parameter(key) for key in settings)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         return scene.with_part(
             parts.PluginNumbers(
                 self.name,
-                mitsuba_data.plugin_numbers(scene, self.name, tuple(self._given)),
+                mitsuba_data.find_plugin_numbers(
+                    scene, self.name, tuple(self._settings)
+                ),
             )
         )
 
-    def laid_out(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
+    def list_parameter_specs(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
         """Yield one parameter for each number of what was set, with its spec.
 
         Raises InputError: a color has a list of values.
@@ -89,7 +91,9 @@ class MitsubaControl(Control):
             )
         return inputs
 
-    def is_compared(self, parameter: Parameter, spec: Fixed | Range | OneOf) -> bool:
+    def must_match_scene(
+        self, parameter: Parameter, spec: Fixed | Range | OneOf
+    ) -> bool:
         return not isinstance(spec, Fixed)
 
     def _get_numbers(self) -> tuple[parts.PluginNumber, ...]:
@@ -106,8 +110,8 @@ def _make_parameter(key: str, valid: tuple[str, ...] = ("differences",)) -> Para
         key,
         (),
         "1",
-        -Parameter.LARGEST,
-        Parameter.LARGEST,
+        -Parameter.MAX_VALUE,
+        Parameter.MAX_VALUE,
         "the scene's own",
         f"Mitsuba's {key}.",
         estimators=valid,

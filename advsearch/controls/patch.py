@@ -48,13 +48,13 @@ from advsearch.extend import (
 BASE_COLOR = "object.base_color"
 NORMS = ("box", "linf", "l2")
 # smallest and largest side of the base-colour map that is painted into, in texels
-BASE_SIDES = (512, 1024)
-REACH = 0.75
+MAP_SIDES = (512, 1024)
+PAINT_RADIUS = 0.75
 """Radius around the middle, in sides of the square, within which the surface is
 painted: its corners are at 0.7071.
 """
 # cosines between the surface and the square's normal between which it fades in
-FACING = (0.1, 0.3)
+FACING_COSINES = (0.1, 0.3)
 EDGE_TEXELS = 2.0  # width of the soft edge in texels
 
 
@@ -66,7 +66,7 @@ class PatchControl(PictureControl):
     """
 
     kind = "patch"
-    shown = "pixels"
+    image_parameter = "pixels"
     parameters = (
         Parameter(
             "pixels",
@@ -140,7 +140,7 @@ class PatchControl(PictureControl):
             "Radius of that ball, display-referred; by default 0.1 a pixel value.",
             "epsilon",
             "pixels",
-            most=PictureControl.LARGEST_EPSILON,
+            most=PictureControl.MAX_EPSILON,
         ),
         Choice(
             "picture",
@@ -184,7 +184,7 @@ class PatchControl(PictureControl):
             ),
             None,
         )
-        if ball and not self.free:
+        if ball and not self.is_searched_image:
             raise InputError(
                 f"{self.name}.{ball}: is of the ball that searched pixels stay in, and "
                 "these are fixed; leave it out, "
@@ -193,7 +193,7 @@ class PatchControl(PictureControl):
 
     def check_choices(self) -> None:
         epsilon = self.chosen["epsilon"]
-        if "norm" not in self._given and epsilon is not None:
+        if "norm" not in self._settings and epsilon is not None:
             self.chosen["norm"] = "linf"
         if self.chosen["norm"] == "box" and epsilon is not None:
             raise InputError(
@@ -203,11 +203,12 @@ class PatchControl(PictureControl):
 
     # ---- in a scene
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         if parameter.name not in ("azimuth", "height"):
-            return super().in_scene(parameter)
+            return super().resolve_parameter(parameter)
         return replace(
-            parameter, default=towards_camera(self.scene)[parameter.name == "height"]
+            parameter,
+            default=find_side_towards_camera(self.scene)[parameter.name == "height"],
         )
 
     def fit(self) -> None:
@@ -225,28 +226,32 @@ class PatchControl(PictureControl):
         n_pixels = self.sides[0]
         pixels = self.slots[0]
         picture = self.read_picture()
-        self._picture = None if picture is None else images.resampled(picture, n_pixels)
+        self._picture = (
+            None if picture is None else images.resize_to_square(picture, n_pixels)
+        )
         start_values = {
             name: float(value)
             for name, value in self.values(self.start).items()
             if name != "pixels"
         }
-        self._sticker = Sticker(self.scene, start_values, n_pixels)
+        self._sticker = PatchPainter(self.scene, start_values, n_pixels)
         if isinstance(pixels.spec, Range):
             low = pixels.spec.low
             high = pixels.spec.high
-            underneath = (self._sticker.underneath() - low) / (high - low)
-            self.start[: pixels.width] = underneath.clamp(0.0, 1.0).reshape(-1)
+            underneath = (self._sticker.sample_underneath() - low) / (high - low)
+            self.start[: pixels.n_coordinates] = underneath.clamp(0.0, 1.0).reshape(-1)
             if not torch.allclose(underneath.clamp(0.0, 1.0), underneath, atol=1e-5):
-                self.note_moved(
+                self.record_adjusted_default(
                     pixels.parameter,
                     "the texture underneath",
                     f"the nearest {pixels.spec}",
                 )
 
-    def is_compared(self, parameter: Parameter, spec: Fixed | Range | OneOf) -> bool:
+    def must_match_scene(
+        self, parameter: Parameter, spec: Fixed | Range | OneOf
+    ) -> bool:
         # at the start searched pixels show no patch
-        return not self.free and parameter.name != "pixels"
+        return not self.is_searched_image and parameter.name != "pixels"
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
@@ -257,15 +262,15 @@ class PatchControl(PictureControl):
             )
         }
 
-    def printed(self, u: Tensor) -> Tensor | None:
-        return self.values(u)["pixels"] if self.free else None
+    def get_printable_colors(self, u: Tensor) -> Tensor | None:
+        return self.values(u)["pixels"] if self.is_searched_image else None
 
     def kept_pictures(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         pixels = values["pixels"]
         return {
-            self.name: images.enlarged(pixels, -(-images.PRINT_SIDE // len(pixels))),
+            self.name: images.enlarge(pixels, -(-images.MIN_PRINT_SIDE // len(pixels))),
             f"{self.name}-pixels": pixels,
         }
 
@@ -273,7 +278,7 @@ class PatchControl(PictureControl):
 # ---- on the surface
 
 
-def towards_camera(scene: SceneDescription) -> tuple[float, float]:
+def find_side_towards_camera(scene: SceneDescription) -> tuple[float, float]:
     """Return the side of the object that faces the camera.
 
     Returns:
@@ -293,14 +298,14 @@ def towards_camera(scene: SceneDescription) -> tuple[float, float]:
 def _sample_pixels(pixels: Tensor, positions: Tensor) -> Tensor:
     """Interpolate pixels (n, n, 3) sRGB at positions (N, 2) in [-0.5, 0.5]; linear."""
     grid = (positions * positions.new_tensor([2.0, -2.0]))[None, None]
-    linear = images.planes(color.srgb_to_linear(pixels))
+    linear = images.to_planes(color.srgb_to_linear(pixels))
     sampled = F.grid_sample(
         linear, grid, mode="bilinear", padding_mode="border", align_corners=False
     )
     return sampled[0, :, 0].T
 
 
-def _half_sizes(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float]:
+def _half_sizes(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float]:
     """Return the middle (3,) of a mesh, its largest half-width and its half-height."""
     low = mesh.vertices.min(axis=0).astype(np.float64)
     high = mesh.vertices.max(axis=0).astype(np.float64)
@@ -312,13 +317,13 @@ def _half_sizes(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float]:
 class Spot:
     """The texels that a patch may cover, and their coordinates around its middle."""
 
-    texels: Tensor  # (N,) their numbers, row by row
+    texel_indices: Tensor  # (N,) their numbers, row by row
     flat: Tensor  # (N, 2) their coordinates to the right and upwards, object sizes
     cover: Tensor  # (N,) in [0, 1]: how much they face the patch
     spacing: float  # distance between neighbouring texels on the surface, object sizes
 
 
-class Sticker:
+class PatchPainter:
     """Paints a patch into the object's base-color map.
 
     Args:
@@ -328,7 +333,7 @@ class Sticker:
     """
 
     def __init__(
-        self, scene: SceneDescription, resting: Mapping[str, float], side: int
+        self, scene: SceneDescription, start_values: Mapping[str, float], side: int
     ) -> None:
         """Prepare the object's map and its surface.
 
@@ -342,21 +347,21 @@ class Sticker:
                 "leave patch out, or search the whole texture"
             )
         self._half_sizes = _half_sizes(mesh)
-        self._resting = resting
+        self._resting = start_values
         self._side = side
         self._surface = images.MeshSurface(mesh)
         object_color = color.srgb_to_linear(
             torch.from_numpy(scene.object.base_color.copy())
         )
-        pixel_size = resting["size"] / side
+        pixel_size = start_values["size"] / side
         charts = _rasterise_finely(mesh, max(object_color.shape[:2]), pixel_size)
         self._object_color = _resize_to_square(object_color, len(charts.face))
-        mask = charts.touched
+        mask = charts.is_readable
         self._texels = np.flatnonzero(mask)
         self._faces = charts.face[mask]
-        self._positions = charts.positions()[mask].astype(np.float64)
-        self._normals = charts.normals()[mask].astype(np.float64)
-        self._areas = charts.areas()[mask].astype(np.float64)
+        self._positions = charts.compute_positions()[mask].astype(np.float64)
+        self._normals = charts.compute_normals()[mask].astype(np.float64)
+        self._areas = charts.compute_areas()[mask].astype(np.float64)
         self._spot = lru_cache(maxsize=4)(self._find_spot)
 
     def paint(
@@ -380,7 +385,7 @@ class Sticker:
         spot = self._spot(
             *(float(numbers[name].detach()) for name in ("azimuth", "height", "size"))
         )
-        texels = spot.texels.to(device)
+        texels = spot.texel_indices.to(device)
         on_patch = _rotate(spot.flat.to(device), numbers["rotation"]) / size
         edge_width = EDGE_TEXELS * spot.spacing
         edge = (0.5 - on_patch.abs().amax(dim=1)) * size / edge_width + 0.5
@@ -391,7 +396,7 @@ class Sticker:
         painted = flat.index_copy(0, texels, under + cover * (ink - under))
         return painted.reshape(base.shape)
 
-    def underneath(self) -> Tensor:
+    def sample_underneath(self) -> Tensor:
         """Return the object's own texture where the patch starts, as its pixels.
 
         Returns:
@@ -405,7 +410,7 @@ class Sticker:
         inside = (on_patch.abs().amax(dim=1) < 0.5) & (spot.cover > 0.0)
         if not bool(inside.any()):
             return torch.full((side, side, 3), 0.5)
-        texel_colors = self._object_color.reshape(-1, 3)[spot.texels[inside]]
+        texel_colors = self._object_color.reshape(-1, 3)[spot.texel_indices[inside]]
         positions = on_patch[inside] * torch.tensor([1.0, -1.0]) + 0.5
         colors = _average_in_pixels(texel_colors, positions, side)
         return color.linear_to_srgb(colors).reshape(side, side, 3)
@@ -420,17 +425,21 @@ class Sticker:
         """
         middle, radius, half_height = self._half_sizes
         outwards = _outward_direction(azimuth, height, radius, half_height)
-        face, point = self._surface.hit(
+        face, point = self._surface.find_hit(
             middle + 4.0 * (radius + half_height) * outwards, -outwards
         )
         faces_outwards = float(self._surface.normals[face] @ outwards) >= 0.0
         side = 1.0 if faces_outwards else -1.0
         normal = self._mean_normal(face, point)
         frame = _frame(side * normal, _upward_direction(azimuth, outwards))
-        texel_indices = self._texels_near(face, point, side * frame[2], REACH * size)
+        texel_indices = self._texels_near(
+            face, point, side * frame[2], PAINT_RADIUS * size
+        )
 
         offsets = self._positions[texel_indices] - point
-        flat, cosine = unrolled(offsets, side * self._normals[texel_indices], frame)
+        flat, cosine = unroll_surface(
+            offsets, side * self._normals[texel_indices], frame
+        )
         return Spot(
             torch.from_numpy(self._texels[texel_indices]),
             torch.from_numpy(flat.astype(np.float32)),
@@ -438,11 +447,15 @@ class Sticker:
             self._texel_spacing(texel_indices),
         )
 
-    def _mean_normal(self, face: int, point: assets.Doubles) -> assets.Doubles:
+    def _mean_normal(
+        self, face: int, point: assets.Float64Array
+    ) -> assets.Float64Array:
         """Return the mean normal (3,) over half of the patch's side at the start."""
         face_normal = self._surface.normals[face]
         reach = 0.5 * self._resting["size"]
-        is_near = self._surface.region(face, point, face_normal, reach)[self._faces]
+        is_near = self._surface.find_region(face, point, face_normal, reach)[
+            self._faces
+        ]
         squared = ((self._positions[is_near] - point) ** 2).sum(axis=1)
         weight = np.maximum(1.0 - squared / reach**2, 0.0) ** 2
         total = (self._normals[is_near] * (weight * self._areas[is_near])[:, None]).sum(
@@ -454,17 +467,21 @@ class Sticker:
         return np.asarray(total / length)
 
     def _texels_near(
-        self, face: int, point: assets.Doubles, normal: assets.Doubles, reach: float
-    ) -> assets.Ints:
+        self,
+        face: int,
+        point: assets.Float64Array,
+        normal: assets.Float64Array,
+        reach: float,
+    ) -> assets.IntArray:
         """Return which texels (N,) are connected to a point, face its way and are close."""
         connected = np.flatnonzero(
-            self._surface.region(face, point, normal, reach)[self._faces]
+            self._surface.find_region(face, point, normal, reach)[self._faces]
         )
         offsets = self._positions[connected] - point
         is_close = (offsets**2).sum(axis=1) <= reach**2
         return np.asarray(connected[is_close])
 
-    def _texel_spacing(self, texels: assets.Ints) -> float:
+    def _texel_spacing(self, texels: assets.IntArray) -> float:
         """Return the distance of neighbouring texels on the surface, object sizes."""
         areas = self._areas[texels]
         has_area = areas > 0.0
@@ -475,7 +492,7 @@ class Sticker:
 
 def _outward_direction(
     azimuth: float, height: float, radius: float, half_height: float
-) -> assets.Doubles:
+) -> assets.Float64Array:
     """Return the unit vector (3,) from the middle of an object to a patch on it."""
     angle = math.radians(azimuth)
     lift = (height - 0.5) * math.pi
@@ -490,7 +507,9 @@ def _outward_direction(
     return outwards
 
 
-def _upward_direction(azimuth: float, outwards: assets.Doubles) -> assets.Doubles:
+def _upward_direction(
+    azimuth: float, outwards: assets.Float64Array
+) -> assets.Float64Array:
     """Return the unit vector (3,) that is upright and across the outward direction."""
     angle = math.radians(azimuth)
     level = math.hypot(outwards[0], outwards[1])
@@ -499,15 +518,17 @@ def _upward_direction(azimuth: float, outwards: assets.Doubles) -> assets.Double
     )
 
 
-def _fade_in(cosine: assets.Doubles) -> Tensor:
+def _fade_in(cosine: assets.Float64Array) -> Tensor:
     """Return how much texels are covered by the cosines (N,) of their normals."""
-    low, high = FACING
+    low, high = FACING_COSINES
     return _smooth_step(
         torch.from_numpy(((cosine - low) / (high - low)).astype(np.float32))
     )
 
 
-def _frame(normal: assets.Doubles, upwards: assets.Doubles) -> assets.Doubles:
+def _frame(
+    normal: assets.Float64Array, upwards: assets.Float64Array
+) -> assets.Float64Array:
     """Return a right-handed frame (3, 3): rows right, up and normal.
 
     `up` is as near to a direction as the normal lets it.
@@ -520,9 +541,11 @@ def _frame(normal: assets.Doubles, upwards: assets.Doubles) -> assets.Doubles:
     return np.stack([np.cross(up, normal), up, normal])
 
 
-def unrolled(
-    offsets: assets.Doubles, normals: assets.Doubles, frame: assets.Doubles
-) -> tuple[assets.Doubles, assets.Doubles]:
+def unroll_surface(
+    offsets: assets.Float64Array,
+    normals: assets.Float64Array,
+    frame: assets.Float64Array,
+) -> tuple[assets.Float64Array, assets.Float64Array]:
     """Return the coordinates of points along a surface, and their normals' cosines.
 
     In the tangent plane a point of a circle of radius R lies at `R sin(phi)` where its
@@ -591,15 +614,15 @@ def _rasterise_finely(
         texture_side: longer side of its own texture, texels.
         pixel_size: side of a pixel, object sizes.
     """
-    smallest, largest = BASE_SIDES
+    smallest, largest = MAP_SIDES
     first_side = max(smallest, texture_side)
-    charts = images.rasterised(mesh, first_side)
-    areas = charts.areas()
+    charts = images.rasterize_charts(mesh, first_side)
+    areas = charts.compute_areas()
     spacing = math.sqrt(float(np.median(areas[areas > 0.0])))
     map_side = first_side
     while 2 * map_side <= largest and spacing * first_side / map_side > pixel_size:
         map_side *= 2
-    return charts if map_side == first_side else images.rasterised(mesh, map_side)
+    return charts if map_side == first_side else images.rasterize_charts(mesh, map_side)
 
 
 def _smooth_step(value: Tensor) -> Tensor:

@@ -19,7 +19,12 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Control, Values
 from advsearch.errors import InputError
-from advsearch.scene.geometry import affine, euler, rotation_vector, standing
+from advsearch.scene.geometry import (
+    compute_base_vertices,
+    make_affine,
+    make_euler_rotation,
+    make_vector_rotation,
+)
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import POSE, Parameter
 
@@ -64,11 +69,13 @@ class PoseControl(Control):
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the pose of the mesh, scaled and turned about its middle."""
-        mesh = self.mesh_in(self.scene)
-        base, vertices, floor = _get_base_pose(mesh, self.scene.around.get(mesh.name))
+        mesh = self.get_mesh(self.scene)
+        base, vertices, floor = _get_base_pose(
+            mesh, self.scene.surrounding_meshes.get(mesh.name)
+        )
         base, vertices = (held.to(values["scale"].device) for held in (base, vertices))
         middle = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
-        turned = rotation_vector(values["rotation"]) @ euler(
+        turned = make_vector_rotation(values["rotation"]) @ make_euler_rotation(
             values["yaw"], values["pitch"], values["roll"]
         )
         linear = values["scale"] * turned
@@ -80,7 +87,7 @@ class PoseControl(Control):
         translation = (
             shift - linear @ middle + torch.cat([middle[:2], middle.new_zeros(1)])
         )
-        return {f"{mesh.name}.to_world": affine(linear, translation) @ base}
+        return {f"{mesh.name}.to_world": make_affine(linear, translation) @ base}
 
 
 @lru_cache(maxsize=16)
@@ -100,7 +107,7 @@ def _get_base_pose(
     """
     if placed is None:
         return torch.eye(4), torch.from_numpy(mesh.mesh.vertices), 0.0
-    positions = standing(placed)
+    positions = compute_base_vertices(placed)
     return (
         torch.from_numpy(placed.to_world).float(),
         torch.from_numpy(positions).float(),

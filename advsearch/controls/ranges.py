@@ -28,17 +28,17 @@ from advsearch.distributions import (
     DISTRIBUTION,
     FROM_PYTHON,
     WEIGHTS,
-    OwnQuantiles,
-    as_setting,
+    PythonQuantiles,
+    distribution_to_setting,
 )
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.settings import Parameter
 
-Number = float | str
+ParameterValue = float | str
 
 Quantiles = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
-COMMON = (
+COMMON_DISTRIBUTIONS = (
     "norm",
     "truncnorm",
     "uniform",
@@ -51,36 +51,36 @@ COMMON = (
 )
 """Names that a message tells."""
 
-TAIL = 1e-6  # probability of an endless tail that is left out
+TAIL_PROBABILITY = 1e-6  # probability of an endless tail that is left out
 
 # probability outside of a parameter's bounds, where a distribution is cut off, at most
-MOST_OUTSIDE = 0.01
+MAX_OUTSIDE_PROBABILITY = 0.01
 
-CHECKED = 257  # shares at which a function from Python is looked at
+N_CHECKED_QUANTILES = 257  # shares at which a function from Python is looked at
 
-NEAR = 1e-4  # half of the step over which the slope of a quantile is taken
+SLOPE_STEP = 1e-4  # half of the step over which the slope of a quantile is taken
 
 
 @dataclass(frozen=True)
 class Fixed:
     """One value, not searched."""
 
-    value: Number
+    value: ParameterValue
 
     def __str__(self) -> str:
-        return shown(self.value)
+        return format_value(self.value)
 
 
 @dataclass(frozen=True)
 class OneOf:
     """One of a few values: numbers or names."""
 
-    values: tuple[Number, ...]
+    values: tuple[ParameterValue, ...]
 
     def __str__(self) -> str:
-        return f"one of {', '.join(map(shown, dict.fromkeys(self.values)))}"
+        return f"one of {', '.join(map(format_value, dict.fromkeys(self.values)))}"
 
-    def at(self, u: Tensor) -> Number:
+    def select(self, u: Tensor) -> ParameterValue:
         """Return the value at a coordinate (): each has an equal part of [0, 1]."""
         index = int(float(u.detach()) * len(self.values))
         return self.values[min(len(self.values) - 1, max(0, index))]
@@ -99,7 +99,7 @@ class Range:
     def __str__(self) -> str:
         return f"from {self.low:g} to {self.high:g}"
 
-    def at(self, u: Tensor, *, log: bool = False) -> Tensor:
+    def interpolate(self, u: Tensor, *, log: bool = False) -> Tensor:
         """Return the values at coordinates in [0, 1]; differentiable."""
         if not log:
             return self.low + (self.high - self.low) * u
@@ -107,7 +107,7 @@ class Range:
         high = torch.full_like(u, math.log(self.high))
         return torch.exp(torch.lerp(low, high, u))
 
-    def coordinate(self, value: float, *, log: bool = False) -> float:
+    def find_coordinate(self, value: float, *, log: bool = False) -> float:
         """Return the coordinate of a value, clipped to [0, 1]."""
         low = self.low
         high = self.high
@@ -119,43 +119,50 @@ class Range:
 
 
 @dataclass(frozen=True)
-class DrawnRange(Range):
-    """Values from `low` to `high`, the shares `least` to `most` of a distribution.
+class DistributionRange(Range):
+    """Values from `low` to `high`, the shares `lower_probability` to `upper_probability` of a distribution.
 
     Its quantiles, and what it is.
     """
 
     quantiles: Quantiles
-    least: float
-    most: float
-    text: str
+    lower_probability: float
+    upper_probability: float
+    label: str
 
-    def at(self, u: Tensor, *, log: bool = False) -> Tensor:
+    def interpolate(self, u: Tensor, *, log: bool = False) -> Tensor:
         """Return the values at coordinates in [0, 1].
 
         Differentiable, by the slope of the quantiles.
         """
         values = self._values(u.detach())
         if u.requires_grad:
-            upper = (u.detach() + NEAR).clamp(max=1.0)
-            lower = (u.detach() - NEAR).clamp(min=0.0)
+            upper = (u.detach() + SLOPE_STEP).clamp(max=1.0)
+            lower = (u.detach() - SLOPE_STEP).clamp(min=0.0)
             slope = (self._values(upper) - self._values(lower)) / (upper - lower)
             values = values + slope * (u - u.detach())
         return values
 
     def _values(self, u: Tensor) -> Tensor:
-        probabilities = self.least + (self.most - self.least) * u.double().cpu().numpy()
+        probabilities = (
+            self.lower_probability
+            + (self.upper_probability - self.lower_probability)
+            * u.double().cpu().numpy()
+        )
         return torch.from_numpy(
             np.clip(self.quantiles(np.asarray(probabilities)), self.low, self.high)
         ).to(u)
 
-    def coordinate(self, value: float, *, log: bool = False) -> float:
+    def find_coordinate(self, value: float, *, log: bool = False) -> float:
         """Return the coordinate of a value, by bisection."""
         lower = 0.0
         upper = 1.0
         for _ in range(60):
             middle = 0.5 * (lower + upper)
-            probability = self.least + (self.most - self.least) * middle
+            probability = (
+                self.lower_probability
+                + (self.upper_probability - self.lower_probability) * middle
+            )
             if float(self.quantiles(np.asarray(probability))) < value:
                 lower = middle
             else:
@@ -166,51 +173,51 @@ class DrawnRange(Range):
 Spec = Fixed | Range | OneOf
 
 
-def plain(given: object) -> object:
+def to_plain_value(value: object) -> object:
     """Return numbers and arrays of numpy and torch, also in a list, as Python's.
 
     Distributions are returned as settings.
     """
-    given = as_setting(given)
-    if isinstance(given, (list, tuple)):
-        return type(given)(map(plain, given))
+    value = distribution_to_setting(value)
+    if isinstance(value, (list, tuple)):
+        return type(value)(map(to_plain_value, value))
     return (
-        given.tolist()
-        if hasattr(given, "tolist") and hasattr(given, "dtype")
-        else given
+        value.tolist()
+        if hasattr(value, "tolist") and hasattr(value, "dtype")
+        else value
     )
 
 
-def read(where: str, parameter: Parameter, given: object) -> Spec:
+def parse_spec(label: str, parameter: Parameter, setting: object) -> Spec:
     """Parse what a parameter was set to.
 
     Args:
-        where: how messages name it, e.g. "pose.yaw".
+        label: how messages name it, e.g. "pose.yaw".
         parameter: says what is allowed.
-        given: a number or a name, [low, high], a list of values, {"range": [low,
+        setting: a number or a name, [low, high], a list of values, {"range": [low,
             high]}, {"choices": [...]}, perhaps with "weights", or a distribution.
 
     Raises:
         InputError: not such a form, or a value outside the parameter's range.
     """
-    if isinstance(given, Mapping):
-        if DISTRIBUTION in given and not parameter.options:
-            return read_drawn(where, parameter, given)
-        is_range = set(given) == {"range"} and _is_list(given["range"])
-        if not is_range or len(given["range"]) != 2:
-            return _read_choices(where, parameter, given)
-        given = given["range"]
-    if not _is_list(given):
-        return Fixed(_check_value(where, parameter, given))
-    values = [_check_value(where, parameter, value) for value in given]
+    if isinstance(setting, Mapping):
+        if DISTRIBUTION in setting and not parameter.options:
+            return parse_distribution(label, parameter, setting)
+        is_range = set(setting) == {"range"} and _is_list(setting["range"])
+        if not is_range or len(setting["range"]) != 2:
+            return _read_choices(label, parameter, setting)
+        setting = setting["range"]
+    if not _is_list(setting):
+        return Fixed(_check_value(label, parameter, setting))
+    values = [_check_value(label, parameter, value) for value in setting]
     if values and (parameter.options or len(values) > 2):
-        return _make_choice(where, values)
+        return _make_choice(label, values)
     if len(values) != 2:
         raise InputError(
-            f"{where}: expected a value, [low, high] or a list of values, got {given!r}"
+            f"{label}: expected a value, [low, high] or a list of values, got {setting!r}"
         )
     low, high = (float(value) for value in values)
-    _check_bounds(where, parameter, low, high)
+    _check_bounds(label, parameter, low, high)
     return Range(low, high)
 
 
@@ -243,7 +250,7 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
         )
     if low > high:
         remedy = f"write [{high:g}, {low:g}]"
-        if parameter.periodic and low - high < TURN:
+        if parameter.periodic and low - high < FULL_TURN:
             remedy = _explain_turn(parameter, low, high)
         raise InputError(
             f"{where}: the range [{low:g}, {high:g}] is reversed; {remedy}"
@@ -258,36 +265,36 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
 def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
     """Return both ranges of angles that a reversed one may mean, for a message."""
     begin = low
-    end = high + TURN
-    if low - TURN >= parameter.low:
-        begin = low - TURN
+    end = high + FULL_TURN
+    if low - FULL_TURN >= parameter.low:
+        begin = low - FULL_TURN
         end = high
-    through = 0 if begin <= 0 else TURN
+    through = 0 if begin <= 0 else FULL_TURN
     return (
-        f"write [{begin:g}, {end:g}] for the {TURN - low + high:g} "
+        f"write [{begin:g}, {end:g}] for the {FULL_TURN - low + high:g} "
         f"degrees from {low:g} through "
         f"{through:g} to {high:g}, or [{high:g}, {low:g}] "
         f"for the other {low - high:g}"
     )
 
 
-def _make_choice(where: str, values: Sequence[Number]) -> OneOf:
+def _make_choice(where: str, values: Sequence[ParameterValue]) -> OneOf:
     """Return a choice. Raises InputError: a value is there twice."""
     # it would be drawn twice as often
     repeated = [value for value, count in Counter(values).items() if count > 1]
     if repeated:
         raise InputError(
-            f"{where}: expected different choices, got {shown(repeated[0])} "
+            f"{where}: expected different choices, got {format_value(repeated[0])} "
             "twice; leave one of them out"
         )
     return OneOf(tuple(values))
 
 
-MOST_SHARES = 1000  # equal shares of probability that weights are rounded to, at most
+MAX_REPEATS = 1000  # equal shares of probability that weights are rounded to, at most
 
 
 def _make_weighted_choice(
-    where: str, values: Sequence[Number], weights: object
+    where: str, values: Sequence[ParameterValue], weights: object
 ) -> OneOf:
     """Return a choice that has each value as often as its weight says.
 
@@ -309,11 +316,11 @@ def _make_weighted_choice(
     total = sum(valid_weights)
     probabilities = [weight / total for weight in valid_weights]
     repeats = _count_repeats(probabilities)
-    repeated = list[Number]()
+    repeated = list[ParameterValue]()
     for value, probability, count in zip(values, probabilities, repeats, strict=True):
         if probability and not count:
             raise InputError(
-                f"{where}: {shown(value)} has less than a {MOST_SHARES}th "
+                f"{where}: {format_value(value)} has less than a {MAX_REPEATS}th "
                 "of the weight; leave it out"
             )
         repeated += [value] * count
@@ -323,10 +330,10 @@ def _make_weighted_choice(
 def _count_repeats(probabilities: Sequence[float]) -> list[int]:
     """Return how often each value is repeated so that it has its probability.
 
-    By the smallest exact number of repeats under `MOST_SHARES`, or rounded to that.
+    By the smallest exact number of repeats under `MAX_REPEATS`, or rounded to that.
     """
-    total = MOST_SHARES
-    for candidate in range(1, MOST_SHARES):
+    total = MAX_REPEATS
+    for candidate in range(1, MAX_REPEATS):
         errors = [
             abs(candidate * probability - round(candidate * probability))
             for probability in probabilities
@@ -340,9 +347,9 @@ def _count_repeats(probabilities: Sequence[float]) -> list[int]:
     return [end - begin for begin, end in pairwise(ends)]
 
 
-def by_distribution(spec: Spec) -> bool:
+def has_distribution(spec: Spec) -> bool:
     """Return whether a spec says how likely each value is."""
-    return isinstance(spec, DrawnRange) or (
+    return isinstance(spec, DistributionRange) or (
         isinstance(spec, OneOf) and len({*spec.values}) < len(spec.values)
     )
 
@@ -351,7 +358,7 @@ def _is_list(value: object) -> TypeGuard[Sequence[Any]]:
     return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
 
 
-def _check_value(label: str, parameter: Parameter, value: object) -> Number:
+def _check_value(label: str, parameter: Parameter, value: object) -> ParameterValue:
     """Return a value of a parameter. Raises InputError: it cannot have it."""
     if parameter.options:
         if not isinstance(value, str):
@@ -372,46 +379,54 @@ def _check_value(label: str, parameter: Parameter, value: object) -> Number:
         raise InputError(
             f"{label}: expected a number from {parameter.low:g} to {parameter.high:g} "
             f"({parameter.unit}), "
-            f"got {shown(value)}"
+            f"got {format_value(value)}"
         )
     return float(value)
 
 
-TURN = 360.0
-CLOSE = 1e-6  # relative difference up to which two values are the same
+FULL_TURN = 360.0
+RELATIVE_TOLERANCE = 1e-6  # relative difference up to which two values are the same
 
 
-def same(one: Number, other: Number, *, turns: bool = False) -> bool:
+def is_same_value(
+    first: ParameterValue, second: ParameterValue, *, is_angle: bool = False
+) -> bool:
     """Return whether two values are the same, up to a rounding error.
 
     Angles that turn are the same up to whole turns.
     """
-    if isinstance(one, str) or isinstance(other, str):
-        return one == other
-    return apart(one, other, turns=turns) <= CLOSE * max(1.0, abs(one), abs(other))
+    if isinstance(first, str) or isinstance(second, str):
+        return first == second
+    return compute_difference(
+        first, second, is_angle=is_angle
+    ) <= RELATIVE_TOLERANCE * max(1.0, abs(first), abs(second))
 
 
-def apart(one: float, other: float, *, turns: bool = False) -> float:
+def compute_difference(first: float, second: float, *, is_angle: bool = False) -> float:
     """Return how far two numbers are from each other.
 
     Angles that turn, the nearer way around.
     """
-    return abs(math.remainder(one - other, TURN) if turns else one - other)
+    return abs(
+        math.remainder(first - second, FULL_TURN) if is_angle else first - second
+    )
 
 
-def nearest(value: float, low: float, high: float, *, turns: bool = False) -> float:
+def clip_to_range(
+    value: float, low: float, high: float, *, is_angle: bool = False
+) -> float:
     """Return the value in a range that is nearest to a value.
 
     Of an angle that turns it is the nearest way around.
     """
-    if turns:
-        value = low + (value - low) % TURN
-        if value > high and value - high > low + TURN - value:
+    if is_angle:
+        value = low + (value - low) % FULL_TURN
+        if value > high and value - high > low + FULL_TURN - value:
             value = low
     return min(max(value, low), high)
 
 
-def shown(value: Number) -> str:
+def format_value(value: ParameterValue) -> str:
     """Return a value as it is written."""
     if isinstance(value, int) and not Parameter.is_number(value):
         return f"a whole number of {value.bit_length()} bits"
@@ -427,38 +442,38 @@ class Slot:
 
     parameter: Parameter
     spec: Spec
-    begin: int = 0
+    offset: int = 0
 
     @property
-    def size(self) -> int:
+    def n_values(self) -> int:
         """How many numbers its value has."""
         return math.prod(side or 1 for side in self.parameter.shape)
 
     @property
-    def width(self) -> int:
+    def n_coordinates(self) -> int:
         """Number of coordinates of u."""
         if isinstance(self.spec, Fixed):
             return 0
         if isinstance(self.spec, OneOf):
             return 1
-        return self.size
+        return self.n_values
 
     @property
-    def turns(self) -> bool:
+    def is_angle(self) -> bool:
         """Whether a whole turn changes nothing."""
         return self.parameter.periodic and self.parameter.unit == "degrees"
 
     @property
-    def periodic(self) -> bool:
+    def is_full_turn(self) -> bool:
         """Whether the range is a whole turn."""
         spec = self.spec
         return (
             self.parameter.periodic
             and type(spec) is Range
-            and abs(spec.high - spec.low - TURN) < 1e-9
+            and abs(spec.high - spec.low - FULL_TURN) < 1e-9
         )
 
-    def start_value(self) -> Number:
+    def start_value(self) -> ParameterValue:
         """Return the default, or the nearest value that is allowed.
 
         Of names, the first one that is allowed.
@@ -468,69 +483,77 @@ class Slot:
         if isinstance(spec, Fixed):
             return spec.value
         if isinstance(spec, Range):
-            return nearest(float(default), spec.low, spec.high, turns=self.turns)
+            return clip_to_range(
+                float(default), spec.low, spec.high, is_angle=self.is_angle
+            )
         if default in spec.values:
             return default
         if any(isinstance(value, str) for value in (default, *spec.values)):
             return spec.values[0]
         return min(
             spec.values,
-            key=lambda value: apart(float(value), float(default), turns=self.turns),
+            key=lambda value: compute_difference(
+                float(value), float(default), is_angle=self.is_angle
+            ),
         )
 
-    def start(self) -> list[float]:
+    def start_coordinates(self) -> list[float]:
         """Return the coordinates of that value."""
         spec = self.spec
         value = self.start_value()
         if isinstance(spec, Range):
-            return [spec.coordinate(float(value), log=self.parameter.log)] * self.size
+            return [
+                spec.find_coordinate(float(value), log=self.parameter.log)
+            ] * self.n_values
         if isinstance(spec, OneOf):
             return [(spec.values.index(value) + 0.5) / len(spec.values)]
         return []
 
 
-def read_drawn(
-    where: str, parameter: Parameter, given: Mapping[str, object]
-) -> DrawnRange:
+def parse_distribution(
+    label: str, parameter: Parameter, setting: Mapping[str, object]
+) -> DistributionRange:
     """Parse the distribution of a parameter, {distribution: NAME, PARAMETER: NUMBER}.
 
     Args:
-        where: how messages name the parameter.
+        label: how messages name the parameter.
         parameter: whose bounds cut the distribution off.
-        given: the setting.
+        setting: the setting.
 
     Raises:
         InputError: it has other parameters, it was a function from Python, or more of
-            it than `MOST_OUTSIDE` lies outside of the bounds.
+            it than `MAX_OUTSIDE_PROBABILITY` lies outside of the bounds.
         UnknownNameError: there is none of that name.
     """
-    if isinstance(given, OwnQuantiles):
-        return _read_python_quantiles(where, parameter, given)
-    name = given[DISTRIBUTION]
+    if isinstance(setting, PythonQuantiles):
+        return _read_python_quantiles(label, parameter, setting)
+    name = setting[DISTRIBUTION]
     if name == FROM_PYTHON:
         raise InputError(
-            f"{where}: its values were drawn by {given.get('name', 'a function')}, "
+            f"{label}: its values were drawn by {setting.get('name', 'a function')}, "
             "which only the Python session that "
             "asked has; pass it again in the same call, with `resume=True` to go on"
         )
-    arguments = {key: value for key, value in given.items() if key != DISTRIBUTION}
-    frozen, text = _freeze_distribution(where, name, arguments)
+    arguments = {key: value for key, value in setting.items() if key != DISTRIBUTION}
+    frozen, text = _freeze_distribution(label, name, arguments)
     with np.errstate(all="ignore"):  # far from where it is, some formulas overflow
         lower_probability = float(frozen.cdf(parameter.low))
         upper_probability = float(frozen.cdf(parameter.high))
         outside = lower_probability + float(frozen.sf(parameter.high))
         has_end = np.isfinite(frozen.ppf(np.array([0.0, 1.0])))
-    if outside > MOST_OUTSIDE:
+    if outside > MAX_OUTSIDE_PROBABILITY:
         raise InputError(
-            f"{where}: {100.0 * outside:.3g} % of {text} lies outside of "
+            f"{label}: {100.0 * outside:.3g} % of {text} lies outside of "
             f"{parameter.low:g} to {parameter.high:g} "
-            f"({parameter.unit}), and at most {100.0 * MOST_OUTSIDE:g} % is cut off; "
+            f"({parameter.unit}), and at most {100.0 * MAX_OUTSIDE_PROBABILITY:g} % is cut off; "
             "choose a narrower one, or cut it "
             "yourself (truncnorm)"
         )
-    lower_probability = max(lower_probability, 0.0 if has_end[0] else TAIL)
-    upper_probability = min(upper_probability, 1.0 if has_end[1] else 1.0 - TAIL)
-    return _make_range(where, frozen.ppf, lower_probability, upper_probability, text)
+    lower_probability = max(lower_probability, 0.0 if has_end[0] else TAIL_PROBABILITY)
+    upper_probability = min(
+        upper_probability, 1.0 if has_end[1] else 1.0 - TAIL_PROBABILITY
+    )
+    return _make_range(label, frozen.ppf, lower_probability, upper_probability, text)
 
 
 def _freeze_distribution(
@@ -545,7 +568,7 @@ def _freeze_distribution(
         raise UnknownNameError(
             f"distribution of {where}",
             str(name),
-            COMMON,
+            COMMON_DISTRIBUTIONS,
             "It is one of scipy.stats, of real numbers.",
         )
     written = []
@@ -570,8 +593,8 @@ def _freeze_distribution(
 
 
 def _read_python_quantiles(
-    label: str, parameter: Parameter, setting: OwnQuantiles
-) -> DrawnRange:
+    label: str, parameter: Parameter, setting: PythonQuantiles
+) -> DistributionRange:
     """Return the spec of a function from Python, an inverse CDF."""
     name = str(setting["name"])
 
@@ -581,9 +604,11 @@ def _read_python_quantiles(
 
     with np.errstate(all="ignore"):
         has_end = np.isfinite(quantiles(np.array([0.0, 1.0])))
-    lower_probability = 0.0 if has_end[0] else TAIL
-    upper_probability = 1.0 if has_end[1] else 1.0 - TAIL
-    probabilities = np.linspace(lower_probability, upper_probability, CHECKED)
+    lower_probability = 0.0 if has_end[0] else TAIL_PROBABILITY
+    upper_probability = 1.0 if has_end[1] else 1.0 - TAIL_PROBABILITY
+    probabilities = np.linspace(
+        lower_probability, upper_probability, N_CHECKED_QUANTILES
+    )
     values = quantiles(probabilities)
     is_inside = (values >= parameter.low) & (values <= parameter.high)
     if not is_inside.all():
@@ -611,7 +636,7 @@ def _make_range(
     lower_probability: float,
     upper_probability: float,
     label: str,
-) -> DrawnRange:
+) -> DistributionRange:
     """Return a range between two probabilities of a distribution."""
     low, high = (
         float(value)
@@ -621,4 +646,6 @@ def _make_range(
         raise InputError(
             f"{setting_name}: {label} has only the value {low:g}; write that to fix it"
         )
-    return DrawnRange(low, high, quantiles, lower_probability, upper_probability, label)
+    return DistributionRange(
+        low, high, quantiles, lower_probability, upper_probability, label
+    )

@@ -128,12 +128,10 @@ class SensorControl(Control):
     )
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
-        return through_sensor(image, values, int(self.chosen["seed"]))
+        return apply_sensor(image, values, int(self.chosen["seed"]))
 
 
-def through_sensor(
-    image: Tensor, values: Mapping[str, Tensor], seed: int = 0
-) -> Tensor:
+def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> Tensor:
     """Return a picture as a camera would have taken it.
 
     Args:
@@ -146,27 +144,27 @@ def through_sensor(
         `compression`, past which the derivative is that of the picture before it.
     """
     height, width = image.shape[:2]
-    light = color.srgb_to_linear(image) * vignette(
+    light = color.srgb_to_linear(image) * compute_vignette(
         height, width, values["vignetting"]
     ).to(image.device)
-    light = aberrated(light, values["aberration"])
+    light = apply_aberration(light, values["aberration"])
     variance = values["shot"] ** 2 * light + values["read"] ** 2
     spread = torch.sqrt(variance + _DARK**2) - _DARK
-    light = light + spread * images.drawn(height, width, seed, "sensor").to(light)
-    light = light + values["mosaic"] * (demosaiced(light) - light)
+    light = light + spread * images.draw_noise(height, width, seed, "sensor").to(light)
+    light = light + values["mosaic"] * (apply_mosaic(light) - light)
     gains = torch.stack(
         [2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]]
     )
     display = color.linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
     compression = round(float(values["compression"].detach()))
     return (
-        images.coded(display, 100 - compression).clamp(0.0, 1.0)
+        images.compress_jpeg(display, 100 - compression).clamp(0.0, 1.0)
         if compression
         else display
     )
 
 
-def vignette(height: int, width: int, amount: Tensor) -> Tensor:
+def compute_vignette(height: int, width: int, amount: Tensor) -> Tensor:
     """Return the fraction of the light (H, W, 1) that comes through a lens.
 
     `amount` () is missing in the corners.
@@ -177,7 +175,7 @@ def vignette(height: int, width: int, amount: Tensor) -> Tensor:
     return ((1.0 + ((1.0 - amount) ** -0.5 - 1.0) * square.to(amount)) ** -2)[..., None]
 
 
-def aberrated(image: Tensor, amount: Tensor) -> Tensor:
+def apply_aberration(image: Tensor, amount: Tensor) -> Tensor:
     """Return an image (H, W, 3) with lateral chromatic aberration.
 
     Red is larger by a factor 1 + amount about the middle, blue is smaller.
@@ -190,7 +188,7 @@ def aberrated(image: Tensor, amount: Tensor) -> Tensor:
     )
     outwards = torch.stack([right, down], dim=-1).to(image)
     red, blue = (
-        images.warped(
+        images.warp(
             image[..., k : k + 1], outwards * (1.0 / (1.0 + sign * amount) - 1.0)
         )
         for k, sign in ((0, 1), (2, -1))
@@ -198,7 +196,7 @@ def aberrated(image: Tensor, amount: Tensor) -> Tensor:
     return torch.cat([red, image[..., 1:2], blue], dim=-1)
 
 
-def demosaiced(light: Tensor) -> Tensor:
+def apply_mosaic(light: Tensor) -> Tensor:
     """Return an image (H, W, 3) after a Bayer mosaic (RGGB).
 
     Each pixel keeps one channel, and gets the others from neighbors, bilinearly.
@@ -212,8 +210,8 @@ def demosaiced(light: Tensor) -> Tensor:
     kernel = light.new_tensor(
         [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]
     ).expand(3, 1, 3, 3)
-    total = F.conv2d(images.planes(light * is_measured), kernel, padding=1, groups=3)
-    weight = F.conv2d(images.planes(is_measured), kernel, padding=1, groups=3)
+    total = F.conv2d(images.to_planes(light * is_measured), kernel, padding=1, groups=3)
+    weight = F.conv2d(images.to_planes(is_measured), kernel, padding=1, groups=3)
     return torch.where(
-        is_measured > 0.0, light, images.picture(total / weight.clamp_min(1e-6))
+        is_measured > 0.0, light, images.to_image(total / weight.clamp_min(1e-6))
     )

@@ -8,7 +8,7 @@ The card is a polygon around a center, in the plane at a right angle to the ligh
 
 It is a real card: how soft its shadow is follows from the light's size and its own
 distance. Where the camera would see it, it goes farther from the object, up to
-`FARTHEST` times as far; where that does not help it is put away.
+`MAX_DISTANCE_FACTOR` times as far; where that does not help it is put away.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from advsearch.extend import (
     parts,
 )
 
-SMALLEST = 0.01  # a smaller card is put away
-FARTHEST = 8.0
-STEPS = 12
+MIN_SIZE = 0.01  # a smaller card is put away
+MAX_DISTANCE_FACTOR = 8.0
+N_DISTANCES = 12
 """How many times as far it may be so that the camera does not see it, and in how many
 steps that is looked for.
 """
-BELOW_LAMP = 0.7  # where it is at most on the way to a lamp
+MAX_LAMP_FRACTION = 0.7  # where it is at most on the way to a lamp
 # degrees above the ground that light counts from: lower, the card would stand on it
-LOW = 5.0
+MIN_ELEVATION = 5.0
 
 
 _moving = partial(Parameter.moving, ("differences",))
@@ -54,7 +54,7 @@ class ShadowControl(Control):
     kind = "shadow"
     amount = "size"
     # none is changed; but it comes after whatever moves the camera
-    refines = frozenset(geometry.SURROUNDINGS)
+    refines = frozenset(geometry.OCCLUDER_INPUTS)
     parameters = (
         _moving(
             "x",
@@ -116,7 +116,7 @@ class ShadowControl(Control):
         _moving(
             "elevation",
             "degrees",
-            LOW,
+            MIN_ELEVATION,
             90.0,
             "the strongest light's",
             "Height of that direction above the ground plane.",
@@ -137,10 +137,10 @@ class ShadowControl(Control):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Add the card, out of sight."""
         texel = np.full((2, 2, 3), 0.1, dtype=np.float32)
-        hidden_pose = geometry.put_away(
+        hidden_pose = geometry.make_hidden_pose(
             torch.from_numpy(geometry.camera_to_world(scene))
         ).numpy()
-        card = parts.polygon(int(self.chosen["corners"]))
+        card = parts.make_polygon(int(self.chosen["corners"]))
         return scene.with_part(
             parts.MeshPart(
                 self.name,
@@ -151,9 +151,9 @@ class ShadowControl(Control):
             )
         )
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter, with the direction of the strongest light as the default."""
-        x, y, z = strongest_light(self.scene)[0]
+        x, y, z = find_strongest_light(self.scene)[0]
         match parameter.name:
             case "radii":
                 return replace(parameter, shape=(int(self.chosen["corners"]),))
@@ -161,7 +161,8 @@ class ShadowControl(Control):
                 return replace(parameter, default=math.degrees(math.atan2(y, x)))
             case "elevation":
                 return replace(
-                    parameter, default=max(math.degrees(math.asin(min(z, 1.0))), LOW)
+                    parameter,
+                    default=max(math.degrees(math.asin(min(z, 1.0))), MIN_ELEVATION),
                 )
         return parameter
 
@@ -170,11 +171,15 @@ class ShadowControl(Control):
     ) -> dict[str, Tensor]:
         """Return the card's pose and the offsets of its corners."""
         radii = values["radii"]
-        rim = torch.from_numpy(parts.polygon(len(radii)).vertices[1:].copy()).to(radii)
+        rim = torch.from_numpy(parts.make_polygon(len(radii)).vertices[1:].copy()).to(
+            radii
+        )
         offsets = torch.cat([torch.zeros(1, 3).to(radii), rim * (radii[:, None] - 1.0)])
         distance = self._find_distance(values, so_far)
         if distance is None:
-            pose = geometry.put_away(geometry.camera_in(self.scene, so_far).to(radii))
+            pose = geometry.make_hidden_pose(
+                geometry.get_camera_pose(self.scene, so_far).to(radii)
+            )
         else:
             pose = self._pose(values, distance)
         return {f"{self.name}.to_world": pose, f"{self.name}.offsets": offsets}
@@ -183,14 +188,14 @@ class ShadowControl(Control):
         """Return the card's pose (4, 4) at a distance from the object's middle."""
         right, up, outwards = torch.from_numpy(self._axes(values)).to(values["x"])
         turn = torch.deg2rad(values["turn"])
-        size = values["size"].clamp_min(SMALLEST)
+        size = values["size"].clamp_min(MIN_SIZE)
         first_axis = torch.cos(turn) * right + torch.sin(turn) * up
         second_axis = torch.cos(turn) * up - torch.sin(turn) * right
-        middle = torch.from_numpy(geometry.middle(self.scene)).to(right)
+        middle = torch.from_numpy(geometry.compute_center(self.scene)).to(right)
         center = middle + distance * outwards
         center = center + values["x"] * right + values["y"] * up
         axes = torch.stack([first_axis, -second_axis, -outwards], dim=1)
-        return geometry.affine(size * axes, center)
+        return geometry.make_affine(size * axes, center)
 
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
@@ -204,9 +209,9 @@ class ShadowControl(Control):
             )
         }
 
-    def _axes(self, values: Values) -> assets.Doubles:
+    def _axes(self, values: Values) -> assets.Float64Array:
         """Rows: to the right and upwards as seen from the light, and towards it."""
-        left, up, outwards = geometry.camera_axes(
+        left, up, outwards = geometry.compute_camera_axes(
             float(values["azimuth"].detach()), float(values["elevation"].detach()), 0.0
         )
         return np.stack([-left, up, outwards])
@@ -223,16 +228,18 @@ class ShadowControl(Control):
         """
         size = float(values["size"].detach())
         requested = float(values["distance"].detach())
-        if size < SMALLEST:
+        if size < MIN_SIZE:
             return None
         right, up, outwards = self._axes(values)
         offset = float(values["x"].detach()) * right + float(values["y"].detach()) * up
-        camera = geometry.camera_in(self.scene, so_far).detach().double().cpu().numpy()
+        camera = (
+            geometry.get_camera_pose(self.scene, so_far).detach().double().cpu().numpy()
+        )
         cone_angle = self._image_cone_angle(so_far)
-        max_distance = BELOW_LAMP * strongest_light(self.scene)[1]
-        for factor in np.geomspace(1.0, FARTHEST, STEPS):
+        max_distance = MAX_LAMP_FRACTION * find_strongest_light(self.scene)[1]
+        for factor in np.geomspace(1.0, MAX_DISTANCE_FACTOR, N_DISTANCES):
             distance = min(requested * factor, max_distance)
-            card = geometry.middle(self.scene) + distance * outwards + offset
+            card = geometry.compute_center(self.scene) + distance * outwards + offset
             in_camera = (card - camera[:3, 3]) @ camera[:3, :3]
             if _is_outside_cone(in_camera, size, cone_angle):
                 return float(distance)
@@ -244,7 +251,7 @@ class ShadowControl(Control):
         aspect = self.scene.aspect
         fov = so_far.get("camera.fov")
         if model is not None:
-            widest = 2.0 * math.atan(math.hypot(*model.tangents))
+            widest = 2.0 * math.atan(math.hypot(*model.visible_tangents))
         elif fov is not None:
             widest = math.radians(float(fov.detach()))
         else:
@@ -257,7 +264,7 @@ class ShadowControl(Control):
         return corner
 
 
-def _is_outside_cone(center: assets.Doubles, radius: float, angle: float) -> bool:
+def _is_outside_cone(center: assets.Float64Array, radius: float, angle: float) -> bool:
     """Return whether a ball is outside of a cone about the camera's axis.
 
     Args:
@@ -273,7 +280,7 @@ def _is_outside_cone(center: assets.Doubles, radius: float, angle: float) -> boo
 
 
 @lru_cache(maxsize=8)
-def strongest_light(scene: SceneDescription) -> tuple[assets.Doubles, float]:
+def find_strongest_light(scene: SceneDescription) -> tuple[assets.Float64Array, float]:
     """Find what puts most light on a surface that faces it.
 
     Returns:
@@ -285,13 +292,13 @@ def strongest_light(scene: SceneDescription) -> tuple[assets.Doubles, float]:
     strongest_distance = math.inf
     max_irradiance = 0.0
     directions, _, power = scene.list_environment_light()
-    is_above = directions[:, 2] >= math.sin(math.radians(LOW))
+    is_above = directions[:, 2] >= math.sin(math.radians(MIN_ELEVATION))
     if is_above.any():
         irradiance = np.where(is_above, power.mean(axis=1), 0.0)
         strongest_direction = directions[int(irradiance.argmax())]
         max_irradiance = float(irradiance.max())
     for lamp in scene.lamps.values():
-        to_lamp, lamp_irradiance = lamp.lighting(geometry.middle(scene))
+        to_lamp, lamp_irradiance = lamp.compute_lighting(geometry.compute_center(scene))
         if float(lamp_irradiance.mean()) > max_irradiance and to_lamp[2] > 0.0:
             strongest_distance = float(np.linalg.norm(to_lamp))
             strongest_direction = to_lamp / strongest_distance

@@ -36,31 +36,31 @@ from advsearch.extend import (
     mitsuba_data,
 )
 
-ROWS = 256  # size of the map
-COLUMNS = 512
+MAP_ROWS = 256  # size of the map
+MAP_COLUMNS = 512
 # radius of the sun in the map, radians; half of its light comes from within 0.7 degrees
 SUN_RADIUS = math.radians(1.5)
 # radius of the real sun, radians: the one that the coefficients are made for
-SUN_APERTURE = math.radians(0.5358 / 2.0)
-SUN_OVER_SKY = 467.069280386
+REAL_SUN_RADIUS = math.radians(0.5358 / 2.0)
+SUN_UNIT_FACTOR = 467.069280386
 """Factor from the unit of the sun's coefficients to that of the sky's, as in Mitsuba's
 plugin.
 """
 TURBIDITIES = (1.0, 10.0)  # what the coefficients cover
-NEARLY_NOTHING = 1e-12
+EPSILON = 1e-12
 
 
 @cache
-def tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the tables that the two models interpolate, see `sunsky_tables`.
+def load_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the tables that the two models interpolate, see `read_sunsky_tables`.
 
     They are read once per process and device.
     """
-    radiance, level, sun = mitsuba_data.sunsky_tables()
+    radiance, level, sun = mitsuba_data.read_sunsky_tables()
     return radiance.to(device), level.to(device), sun.to(device)
 
 
-def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
+def compute_direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
     """Return the unit vector (3,) towards an azimuth and an elevation, () in degrees.
 
     z is up; azimuth 0 is +x.
@@ -98,7 +98,7 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
     )
 
 
-def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
+def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     """Return the sun's irradiance (3,) on a surface that faces it.
 
     In the unit of the sky's radiance times steradian.
@@ -110,14 +110,14 @@ def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     fraction = float(radians.detach()) / (math.pi / 2.0)
     piece = min(44, int(45.0 * max(0.0, fraction) ** (1.0 / 3.0)))
     above = radians - (math.pi / 2.0) * (piece / 45.0) ** 3
-    terms = _at_turbidity(tables(radians.device)[2], turbidity)[piece]
+    terms = _at_turbidity(load_tables(radians.device)[2], turbidity)[piece]
     limb = torch.tensor(
         [2.0 / (power + 2.0) for power in range(6)], device=radians.device
     )
     powers = torch.stack([above**power for power in range(4)])
-    solid_angle = 2.0 * math.pi * (1.0 - math.cos(SUN_APERTURE))
+    solid_angle = 2.0 * math.pi * (1.0 - math.cos(REAL_SUN_RADIUS))
     return (
-        torch.einsum("ckj,k,j->c", terms, powers, limb) * solid_angle * SUN_OVER_SKY
+        torch.einsum("ckj,k,j->c", terms, powers, limb) * solid_angle * SUN_UNIT_FACTOR
     ).clamp_min(0.0)
 
 
@@ -130,22 +130,25 @@ class Sky:
     def __init__(self, ground: Tensor) -> None:
         """Compute the directions and solid angles of the texels above the horizon."""
         self.ground = ground
-        upper = ROWS // 2
+        upper = MAP_ROWS // 2
         elevation = 90.0 - 180.0 * torch.arange(upper, device=ground.device) / (
-            ROWS - 1
+            MAP_ROWS - 1
         )
         azimuth = (
-            90.0 - 360.0 * (torch.arange(COLUMNS, device=ground.device) + 0.5) / COLUMNS
+            90.0
+            - 360.0
+            * (torch.arange(MAP_COLUMNS, device=ground.device) + 0.5)
+            / MAP_COLUMNS
         )
         rows, columns = torch.meshgrid(elevation, azimuth, indexing="ij")
         self.directions = (
-            direction(rows * 0.0 + columns, rows).permute(1, 2, 0).contiguous()
+            compute_direction(rows * 0.0 + columns, rows).permute(1, 2, 0).contiguous()
         )
         self.cosines = self.directions[..., 2:3].clamp_min(0.0)
-        texel = (math.pi / (ROWS - 1)) * (2.0 * math.pi / COLUMNS)
+        texel = (math.pi / (MAP_ROWS - 1)) * (2.0 * math.pi / MAP_COLUMNS)
         self.solid_angles = torch.cos(torch.deg2rad(rows))[..., None] * texel
 
-    def dome(self, sun: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
+    def compute_dome(self, sun: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
         """Return the radiance of the sky above the horizon, without the sun's disk.
 
         Args:
@@ -157,11 +160,11 @@ class Sky:
             (ROWS / 2, COLUMNS, 3).
         """
         a, b, c, d, e, f, g, i, h = self._interpolated(
-            tables(sun.device)[0], elevation, turbidity
+            load_tables(sun.device)[0], elevation, turbidity
         ).unbind(-1)
-        level = self._interpolated(tables(sun.device)[1], elevation, turbidity)
+        level = self._interpolated(load_tables(sun.device)[1], elevation, turbidity)
         cosine = (self.directions @ sun)[..., None]
-        angle = angle_between(self.directions, sun)[..., None]
+        angle = compute_angles(self.directions, sun)[..., None]
         horizon = 1.0 + a * torch.exp(b / (self.cosines + 0.01))
         glow = (1.0 + cosine**2) / (1.0 + h**2 - 2.0 * h * cosine).clamp_min(1e-6).pow(
             1.5
@@ -192,7 +195,7 @@ class Sky:
         albedo = self.ground.reshape(3, *[1] * (curves.ndim - 2))
         return torch.lerp(curves[0], curves[1], albedo)
 
-    def disk(self, sun: Tensor) -> Tensor:
+    def compute_disk(self, sun: Tensor) -> Tensor:
         """Return the sun's shape (ROWS / 2, COLUMNS, 1).
 
         A smooth bump whose integral over solid angle is 1.
@@ -204,7 +207,7 @@ class Sky:
             -1, keepdim=True
         ) / SUN_RADIUS**2
         bump = (1.0 - distance).clamp_min(0.0).square()
-        return bump / (bump * self.solid_angles).sum().clamp_min(NEARLY_NOTHING)
+        return bump / (bump * self.solid_angles).sum().clamp_min(EPSILON)
 
     def __call__(
         self, azimuth: Tensor, elevation: Tensor, turbidity: Tensor
@@ -220,26 +223,26 @@ class Sky:
             Linear radiance (ROWS, COLUMNS, 3); the mean channel () of the
                 irradiance on a surface that faces the sun.
         """
-        sun = direction(azimuth, elevation)
-        upper = self.dome(sun, elevation, turbidity) + self.disk(sun) * sun_irradiance(
-            elevation, turbidity
-        )
+        sun = compute_direction(azimuth, elevation)
+        upper = self.compute_dome(sun, elevation, turbidity) + self.compute_disk(
+            sun
+        ) * compute_sun_irradiance(elevation, turbidity)
         arriving = upper * self.solid_angles
         on_ground = (arriving * self.cosines).sum((0, 1))
-        lower = (self.ground * on_ground / math.pi).expand(ROWS - ROWS // 2, COLUMNS, 3)
+        lower = (self.ground * on_ground / math.pi).expand(
+            MAP_ROWS - MAP_ROWS // 2, MAP_COLUMNS, 3
+        )
         facing = (self.directions @ sun).clamp_min(0.0)[..., None]
         return torch.cat([upper, lower]), (arriving * facing).sum() / 3.0
 
 
-def angle_between(directions: Tensor, towards: Tensor) -> Tensor:
+def compute_angles(directions: Tensor, reference: Tensor) -> Tensor:
     """Return the angle (...) in radians between unit vectors (..., 3) and (3,).
 
     Differentiable at 0 and 180 degrees.
     """
-    half_sine = ((directions - towards).square().sum(-1) / 4.0 + NEARLY_NOTHING).sqrt()
-    half_cosine = (
-        (directions + towards).square().sum(-1) / 4.0 + NEARLY_NOTHING
-    ).sqrt()
+    half_sine = ((directions - reference).square().sum(-1) / 4.0 + EPSILON).sqrt()
+    half_cosine = ((directions + reference).square().sum(-1) / 4.0 + EPSILON).sqrt()
     return 2.0 * torch.atan2(half_sine, half_cosine)
 
 
@@ -297,7 +300,9 @@ class SkyControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         bound = self.bind(scene)
-        radiance = bound.radiance(bound.values(bound.start)).numpy().astype(np.float32)
+        radiance = (
+            bound.compute_radiance(bound.values(bound.start)).numpy().astype(np.float32)
+        )
         sky = assets.EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
         return replace(scene, environment=sky).with_values(
             environment__rotation=0.0, environment__exposure=0.0
@@ -308,22 +313,22 @@ class SkyControl(Control):
         start = self.values(self.start)
         # the sun's azimuth does not matter
         arguments = torch.tensor(0.0), start["elevation"], start["turbidity"]
-        self._metered = sky_over(self.scene.ground_color, torch.device("cpu"))(
+        self._metered = make_sky(self.scene.ground_color, torch.device("cpu"))(
             *arguments
         )[1]
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        return {"environment.data": self.radiance(values)}
+        return {"environment.data": self.compute_radiance(values)}
 
-    def radiance(self, values: Values) -> Tensor:
+    def compute_radiance(self, values: Values) -> Tensor:
         """Return the map (H, W, 3) of linear radiance at some values.
 
         Differentiable.
         """
         arguments = values["azimuth"], values["elevation"], values["turbidity"]
-        radiance, metered = sky_over(self.scene.ground_color, arguments[0].device)(
+        radiance, metered = make_sky(self.scene.ground_color, arguments[0].device)(
             *arguments
         )
         is_fixed = self.chosen["exposure"] == "fixed"
@@ -334,7 +339,7 @@ class SkyControl(Control):
 
 
 @lru_cache(maxsize=4)
-def sky_over(ground: tuple[float, ...], device: torch.device) -> Sky:
+def make_sky(ground: tuple[float, ...], device: torch.device) -> Sky:
     """Return the sky over a ground of an sRGB colour.
 
     Far away it is made of the same as the ground plane.

@@ -13,15 +13,28 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from advsearch.controls.base import NOTHING, Control, Group, Moved, Value, file_name
+from advsearch.controls.base import (
+    NO_INPUTS,
+    AdjustedDefault,
+    Control,
+    Group,
+    Value,
+    to_file_name,
+)
 from advsearch.copies import is_ours
 from advsearch.errors import InputError
-from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
-from advsearch.scene.grounds import CameraView, past, place_of, surroundings_of, view_of
-from advsearch.scene.things import camera_remarks
+from advsearch.scene.description import ENVIRONMENT, SCENE_ENVIRONMENT, SceneDescription
+from advsearch.scene.grounds import (
+    CameraView,
+    find_surroundings,
+    get_camera_position,
+    list_view_remarks,
+    make_camera_view,
+)
+from advsearch.scene.things import list_camera_remarks
 
 # configurations of a camera, a power of two, by which is found how far it goes
-VIEWS = 256
+N_CAMERA_VIEWS = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +49,7 @@ class Space:
     # with everything in it that the controls need; None leaves it to the caller
     scene: SceneDescription | None = None
     # values of the clean scene that the start has not, as a control leaves them out
-    moved: tuple[Moved, ...] = ()
+    adjusted_defaults: tuple[AdjustedDefault, ...] = ()
     # what lights the clean scene in the place of its own environment; None if nothing
     environment: str | None = None
 
@@ -88,9 +101,9 @@ class Space:
             scene.backdrop,
             scene.thin_lens,
             scene.camera_model,
-            scene.cut_out,
-            scene.normal_mapped,
-            scene.emits,
+            scene.has_opacity,
+            scene.has_normal_maps,
+            scene.has_emission,
         )
         has_medium = any(part.volumetric for part in scene.parts)
         return not (any(unsupported) or has_medium)
@@ -100,7 +113,7 @@ class Space:
         """How many coordinates each control has."""
         return [len(control.start) for control in self.controls]
 
-    def slices(self, u: Tensor) -> list[tuple[Control, Tensor]]:
+    def split_by_control(self, u: Tensor) -> list[tuple[Control, Tensor]]:
         """Return each control with its slice of u."""
         return list(zip(self.controls, u.split(self.sizes), strict=True))
 
@@ -154,11 +167,11 @@ class Space:
             rank for rank, index in enumerate(order) if self.controls[index].refines
         ]
         last_refining = max(refining, default=0)
-        so_far = NOTHING
+        so_far = NO_INPUTS
         inputs_before = dict[int, Mapping[str, Tensor]]()
         for rank, index in enumerate(order):
             control = self.controls[index]
-            inputs_before[index] = so_far if control.refines else NOTHING
+            inputs_before[index] = so_far if control.refines else NO_INPUTS
             if rank < last_refining:
                 so_far = {**so_far, **control.inputs(slices[index], so_far)}
         return [
@@ -166,13 +179,13 @@ class Space:
             for index, control in enumerate(self.controls)
         ]
 
-    def picture(self, u: Tensor, image: Tensor) -> Tensor:
+    def apply_to_image(self, u: Tensor, image: Tensor) -> Tensor:
         """Apply what controls do to the finished image (H, W, 3) sRGB, in their order.
 
         Differentiable in both.
         """
         for control, part in zip(self.controls, u.split(self.sizes), strict=True):
-            image = control.picture(part, image)
+            image = control.apply_to_image(part, image)
         return image
 
     def describe(
@@ -190,27 +203,28 @@ class Space:
                 described |= control.describe(part, so_far)
         return described
 
-    def printed(self, u: Tensor) -> dict[str, Tensor]:
+    def get_printable_colors(self, u: Tensor) -> dict[str, Tensor]:
         """Return the searched colours that a printer would print, by control.
 
         See `Control.printed`.
         """
         colors_by_control = (
-            (control.name, control.printed(part)) for control, part in self.slices(u)
+            (control.name, control.get_printable_colors(part))
+            for control, part in self.split_by_control(u)
         )
         return {
             name: colors for name, colors in colors_by_control if colors is not None
         }
 
-    def numbers(self, u: Tensor) -> dict[str, Tensor]:
+    def get_numeric_values(self, u: Tensor) -> dict[str, Tensor]:
         """Return the numbers of a configuration by parameter ("pose.yaw").
 
         See `Control.numbers`.
         """
         return {
             f"{control.name}.{parameter}": value
-            for control, part in self.slices(u)
-            for parameter, value in control.numbers(part).items()
+            for control, part in self.split_by_control(u)
+            for parameter, value in control.get_numeric_values(part).items()
         }
 
     @property
@@ -226,13 +240,14 @@ class Space:
             default=(0.0, 0.0),
         )
 
-    def later(self, seconds: float) -> Space:
+    def advance_time(self, seconds: float) -> Space:
         """Return the space so many seconds later, where a control knows a time."""
         return replace(
-            self, controls=tuple(control.later(seconds) for control in self.controls)
+            self,
+            controls=tuple(control.advance_time(seconds) for control in self.controls),
         )
 
-    def holding(self, u: Tensor) -> Space:
+    def fix_first_controls(self, u: Tensor) -> Space:
         """Return the space whose first controls stay at a configuration.
 
         The others vary.
@@ -257,12 +272,12 @@ class Space:
             for control, part in zip(self.controls, slices, strict=False)
         ]
         first = Space(self.controls[:count], self.scene)
-        lit_by = first.lit_by(first.describe(u)) or self.environment
+        lit_by = first.find_environment(first.describe(u)) or self.environment
         return replace(
             self, controls=(*fixed, *self.controls[count:]), environment=lit_by
         )
 
-    def lit_by(self, values: Mapping[str, Value]) -> str | None:
+    def find_environment(self, values: Mapping[str, Value]) -> str | None:
         """Return the environment that lights a configuration in place of the scene's.
 
         None if none does. `values` are those that describe the configuration.
@@ -270,10 +285,10 @@ class Space:
         for group in self.groups:
             if group.setting == ENVIRONMENT:
                 name = str(values[group.name]["value"])
-                return None if name == OWN_MAP else name
+                return None if name == SCENE_ENVIRONMENT else name
         return self.environment
 
-    def notes(self, scene: SceneDescription) -> tuple[str, ...]:
+    def list_notes(self, scene: SceneDescription) -> tuple[str, ...]:
         """Return what a user should know of the scene, and of how far the camera goes.
 
         See `advsearch.scene.grounds`.
@@ -285,15 +300,15 @@ class Space:
         rotates_map = any(
             group.setting == "environment.rotation" for group in self.groups
         )
-        has_solids = any(part.solids for part in scene.around.values())
+        has_solids = any(part.solids for part in scene.surrounding_meshes.values())
         views = list[CameraView]()
-        if has_solids or surroundings_of(scene) is not None:
+        if has_solids or find_surroundings(scene) is not None:
             views = self._sample_camera_views(scene)
-        eyes = [place_of(view) for view in views] if has_solids else []
+        eyes = [get_camera_position(view) for view in views] if has_solids else []
         return (
             *scene.notes,
-            *past(scene, views, turns=rotates_map),
-            *camera_remarks(scene, eyes),
+            *list_view_remarks(scene, views, rotates_map=rotates_map),
+            *list_camera_remarks(scene, eyes),
         )
 
     def _sample_camera_views(self, scene: SceneDescription) -> list[CameraView]:
@@ -301,35 +316,35 @@ class Space:
 
         Without such a control it is the one view of the scene.
         """
-        for control, start in self.slices(self.start):
+        for control, start in self.split_by_control(self.start):
             has_coordinates = bool(control.slots) or isinstance(control, _FixedControl)
             if has_coordinates and "camera.to_world" in control.inputs(start):
                 return [
                     _view_of_inputs(scene, control.inputs(u))
                     for u in _spread_over_box(len(start))
                 ]
-        return [view_of(scene)]
+        return [make_camera_view(scene)]
 
-    def artifacts(self, u: Tensor) -> dict[str, Tensor]:
+    def get_artifact_images(self, u: Tensor) -> dict[str, Tensor]:
         """Return the images worth storing with a configuration, by file stem."""
         artifacts = dict[str, Tensor]()
         for control, part, so_far in self._with_previous_inputs(u):
-            for name, image in control.artifacts(part, so_far).items():
-                artifacts[file_name(name)] = image
+            for name, image in control.get_artifact_images(part, so_far).items():
+                artifacts[to_file_name(name)] = image
         return artifacts
 
-    def files(self, u: Tensor) -> dict[str, bytes]:
+    def get_artifact_files(self, u: Tensor) -> dict[str, bytes]:
         """Return the other files worth storing with a configuration, by name."""
         files = dict[str, bytes]()
         for control, part, so_far in self._with_previous_inputs(u):
-            for name, content in control.files(part, so_far).items():
-                files[file_name(name)] = content
+            for name, content in control.get_artifact_files(part, so_far).items():
+                files[to_file_name(name)] = content
         return files
 
 
 def _spread_over_box(size: int) -> Tensor:
     """Return points (n, size) spread over the unit box, and both ends of each axis."""
-    spread = SobolEngine(size).draw(VIEWS) if size else torch.zeros(1, 0)
+    spread = SobolEngine(size).draw(N_CAMERA_VIEWS) if size else torch.zeros(1, 0)
     ends = [torch.where(torch.eye(size) > 0.0, end, 0.5) for end in (0.0, 1.0)]
     return torch.cat([spread, *ends])
 
@@ -340,7 +355,7 @@ def _view_of_inputs(
     """Return how a scene is looked at by the camera of scene inputs."""
     to_world = inputs["camera.to_world"].detach().double().numpy()
     fov = float(inputs["camera.fov"]) if "camera.fov" in inputs else None
-    return view_of(scene, to_world, fov)
+    return make_camera_view(scene, to_world, fov)
 
 
 class _FixedControl(Control):
@@ -350,7 +365,7 @@ class _FixedControl(Control):
         self._control = control
         self._u = u
         self.name = control.name
-        self.moved = control.moved
+        self.adjusted_defaults = control.adjusted_defaults
         self.on_top = control.on_top
         self.exposure = control.exposure
         self.flashes = control.flashes
@@ -365,30 +380,30 @@ class _FixedControl(Control):
         return self._control.refines
 
     def inputs(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         return self._control.inputs(self._u, so_far)
 
-    def later(self, seconds: float) -> Control:
-        return _FixedControl(self._control.later(seconds), self._u)
+    def advance_time(self, seconds: float) -> Control:
+        return _FixedControl(self._control.advance_time(seconds), self._u)
 
-    def picture(self, u: Tensor, image: Tensor) -> Tensor:
-        return self._control.picture(self._u, image)
+    def apply_to_image(self, u: Tensor, image: Tensor) -> Tensor:
+        return self._control.apply_to_image(self._u, image)
 
     def describe(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         return self._control.describe(self._u, so_far)
 
-    def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
-        return self._control.numbers(self._u)
+    def get_numeric_values(self, u: Tensor) -> Mapping[str, Tensor]:
+        return self._control.get_numeric_values(self._u)
 
 
-COLOR = (None, None, 3)
-EXPECTED: Mapping[str, tuple[tuple[int | None, ...] | None, float, float]] = {
-    "base_color": (COLOR, 0.0, 1.0),
+COLOR_MAP_SHAPE = (None, None, 3)
+EXPECTED_INPUTS: Mapping[str, tuple[tuple[int | None, ...] | None, float, float]] = {
+    "base_color": (COLOR_MAP_SHAPE, 0.0, 1.0),
     "color": ((3,), 0.0, 1.0),
-    "data": (COLOR, 0.0, math.inf),
+    "data": (COLOR_MAP_SHAPE, 0.0, math.inf),
     "to_world": ((4, 4), -math.inf, math.inf),
     "offsets": ((None, 3), -math.inf, math.inf),
     "exposure": ((), -math.inf, math.inf),
@@ -401,7 +416,7 @@ EXPECTED: Mapping[str, tuple[tuple[int | None, ...] | None, float, float]] = {
 part of their names; None for any number or any shape.
 """
 
-SLACK = 1e-4  # how far past its range rounding may put a colour
+RANGE_TOLERANCE = 1e-4  # how far past its range rounding may put a colour
 
 
 def _check_inputs(control: str, inputs: object) -> None:
@@ -423,7 +438,7 @@ def _check_inputs(control: str, inputs: object) -> None:
                 f"numbers, got {got}"
             )
         anything = (None, -math.inf, math.inf)
-        shape, low, high = EXPECTED.get(name.rpartition(".")[2], anything)
+        shape, low, high = EXPECTED_INPUTS.get(name.rpartition(".")[2], anything)
         if shape is not None and not _has_shape(value, shape):
             sides = ", ".join("N" if side is None else str(side) for side in shape)
             if len(shape) == 1:
@@ -450,7 +465,7 @@ def _check_range(label: str, value: Tensor, low: float, high: float) -> None:
     if not value.numel():
         return
     smallest, largest = (float(bound) for bound in value.detach().aminmax())
-    if low - SLACK <= smallest and largest <= high + SLACK:
+    if low - RANGE_TOLERANCE <= smallest and largest <= high + RANGE_TOLERANCE:
         return
     expected = "numbers"
     hint = ""

@@ -27,33 +27,33 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import (
-    LARGEST_EPSILON,
-    NOTHING,
+    MAX_EPSILON,
+    NO_INPUTS,
     Choice,
     Control,
     Parameter,
     Value,
-    changed,
+    describe_color_change,
 )
-from advsearch.controls.support.images import resampled
-from advsearch.controls.support.norms import DEFAULT_EPSILON, NORMS, radius
+from advsearch.controls.support.images import resize_to_square
+from advsearch.controls.support.norms import DEFAULT_EPSILON, NORMS, compute_radius
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Bools, Doubles, Floats
+from advsearch.scene.assets import BoolArray, Float32Array, Float64Array
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.gradients import Budget, Group
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import rasterised, texels_of_faces
+from advsearch.scene.raster import find_exclusive_texels, rasterize_charts
 
 # smallest and largest side that is taken from the object's own texture when none is
 # asked for
 RESOLUTIONS = (256, 512)
 FORMS = ("texels", "palette", "waves")
-LARGEST_WAVES = 64
-LARGEST_PALETTE = 64
+MAX_WAVES = 64
+MAX_PALETTE = 64
 LLOYD_STEPS = 30
 # share of the texels of materials that must be theirs alone for them to be painted
-LEAST_ALONE = 0.5
+MIN_EXCLUSIVE_FRACTION = 0.5
 WAVE_REACH = 3.0
 """Argument of the tanh that the slowest wave alone reaches at its largest amplitude:
 0.995 of the ball's radius.
@@ -108,7 +108,7 @@ class TextureControl(Control):
             DEFAULT_EPSILON,
             "Radius of the ball around the original texture, display-referred.",
             "epsilon",
-            most=LARGEST_EPSILON,
+            most=MAX_EPSILON,
         ),
         Choice(
             "norm",
@@ -133,13 +133,13 @@ class TextureControl(Control):
             "waves (smooth patterns).",
         ),
         Choice(
-            "colors", 6, "Number of colours of the palette.", whole=(1, LARGEST_PALETTE)
+            "colors", 6, "Number of colours of the palette.", whole=(1, MAX_PALETTE)
         ),
         Choice(
             "waves",
             8,
             "Number of waves along each side of the texture.",
-            whole=(1, LARGEST_WAVES),
+            whole=(1, MAX_WAVES),
         ),
         Choice(
             "materials",
@@ -151,7 +151,7 @@ class TextureControl(Control):
 
     def check_choices(self) -> None:
         """Check the form and the names of materials."""
-        self.form = self.chosen_form(FORMS)
+        self.form = self.select_form(FORMS)
         names = self.chosen["materials"]
         if names is None:
             return
@@ -170,12 +170,12 @@ class TextureControl(Control):
             )
         self.chosen["materials"] = list(dict.fromkeys(names))
 
-    def mesh_in(self, scene: SceneDescription) -> MeshPart:
+    def get_mesh(self, scene: SceneDescription) -> MeshPart:
         """Return the mesh that it paints, which a material of the object may name."""
         if self._named_material(scene):
             return scene.meshes[OBJECT]
         try:
-            return super().mesh_in(scene)
+            return super().get_mesh(scene)
         except UnknownNameError:
             materials = scene.object.mesh.materials
             hint = f"It stands in `controls` {self.name}."
@@ -191,17 +191,17 @@ class TextureControl(Control):
         None where a mesh has that name.
         """
         # takes time, and most do without
-        from advsearch.scene.importing.files import clean
+        from advsearch.scene.importing.files import sanitize_name
 
         if self.mesh in scene.meshes:
             return []
         return [
             material
             for material in scene.object.mesh.materials
-            if self.mesh in (material, clean(material))
+            if self.mesh in (material, sanitize_name(material))
         ]
 
-    def materials_in(self, scene: SceneDescription) -> list[str] | None:
+    def list_materials(self, scene: SceneDescription) -> list[str] | None:
         """Return the materials that it paints in a scene; None for all of the mesh."""
         return self._named_material(scene) or self.chosen["materials"]
 
@@ -211,8 +211,8 @@ class TextureControl(Control):
         Raises:
             InputError, UnknownNameError: materials cannot be painted, or are unknown.
         """
-        part = self.mesh_in(self.scene)
-        names = self.materials_in(self.scene)
+        part = self.get_mesh(self.scene)
+        names = self.list_materials(self.scene)
         self._original = self._resample_original(part, names)
         shape = (self._original.shape[0], self._original.shape[1])
         if names is None:
@@ -239,31 +239,33 @@ class TextureControl(Control):
         if not (resolution or materials is None or longer_side < smallest):
             return original
         default = min(max(longer_side, smallest), largest)
-        return resampled(original, int(resolution or default))
+        return resize_to_square(original, int(resolution or default))
 
     def _make_painter(self, part: MeshPart, mask: Tensor) -> Painter:
         """Return what paints the texels of a mask (h, w) bool, in the form chosen."""
         texels = self._original[mask]
         norm = self.chosen["norm"]
-        epsilon = self._given.get("epsilon")
+        epsilon = self._settings.get("epsilon")
         if self.form == "palette":
             weight = _texel_areas(part, mask)
-            centers = palette(self._original, weight, int(self.chosen["colors"]))
-            budget = Budget(norm, radius(norm, epsilon, centers.numel()))
-            return recoloured(texels, centers, budget)
+            centers = compute_palette(
+                self._original, weight, int(self.chosen["colors"])
+            )
+            budget = Budget(norm, compute_radius(norm, epsilon, centers.numel()))
+            return make_palette_painter(texels, centers, budget)
         if self.form == "waves":
-            reach = radius(norm, epsilon, texels.numel())
+            reach = compute_radius(norm, epsilon, texels.numel())
             if norm == "l2":
                 reach = reach / math.sqrt(texels.numel())
-            return waved(texels, mask, int(self.chosen["waves"]), reach)
+            return make_wave_painter(texels, mask, int(self.chosen["waves"]), reach)
         # each texel value on its own
-        budget = Budget(norm, radius(norm, epsilon, texels.numel()))
+        budget = Budget(norm, compute_radius(norm, epsilon, texels.numel()))
         group = Group("texels", texels.numel(), ("adjoint",), budget)
-        return Painter(texels.reshape(-1), group, as_texels)
+        return Painter(texels.reshape(-1), group, to_texels)
 
     def _texels_of(
         self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]
-    ) -> Bools:
+    ) -> BoolArray:
         """Return which texels (h, w) only lookups on some materials read.
 
         Raises:
@@ -281,8 +283,8 @@ class TextureControl(Control):
             if name not in known:
                 raise UnknownNameError(f"material of {owner}", name, known)
         faces = np.concatenate([known[name] for name in names])
-        mask, fraction = texels_of_faces(part.mesh, faces, shape)
-        if fraction < LEAST_ALONE:
+        mask, fraction = find_exclusive_texels(part.mesh, faces, shape)
+        if fraction < MIN_EXCLUSIVE_FRACTION:
             shared = f"{100 * (1 - fraction):.0f}"
             remedy = ""
             if self.chosen["resolution"]:
@@ -296,7 +298,7 @@ class TextureControl(Control):
         return mask
 
     def inputs(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         return {f"{self._mesh_name}.base_color": srgb_to_linear(self._texels(u))}
 
@@ -310,7 +312,7 @@ class TextureControl(Control):
         return original.index_put(indices, painted)
 
     def describe(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         """Return how much the texels change, and which materials are painted."""
         change = self._painter.texels(u.detach()) - self._unchanged_texels.to(u.device)
@@ -320,16 +322,16 @@ class TextureControl(Control):
                 "value": self._materials,
                 "unit": "name",
             }
-        return described | changed(self.name, change)
+        return described | describe_color_change(self.name, change)
 
-    def printed(self, u: Tensor) -> Tensor | None:
+    def get_printable_colors(self, u: Tensor) -> Tensor | None:
         texels = self._texels(u)
         if self._painted_mask is None:
             return texels
         return torch.cat([texels, self._painted_mask.to(texels)[..., None]], dim=-1)
 
-    def artifacts(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+    def get_artifact_images(
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         return {
             self.name: self._texels(u.detach()),
@@ -350,42 +352,42 @@ class Painter(NamedTuple):
     texels: Callable[[Tensor], Tensor]
 
 
-def _texel_areas(part: MeshPart, mask: Tensor) -> Floats:
+def _texel_areas(part: MeshPart, mask: Tensor) -> Float32Array:
     """Return the area (h, w) that each texel of a mask covers on the surface.
 
     Without any area, each texel of the mask counts 1.
     """
     is_painted = mask.numpy()
-    charts = rasterised(part.mesh, (mask.shape[0], mask.shape[1]))
-    areas = np.where(is_painted, charts.areas(), 0.0).astype(np.float32)
+    charts = rasterize_charts(part.mesh, (mask.shape[0], mask.shape[1]))
+    areas = np.where(is_painted, charts.compute_areas(), 0.0).astype(np.float32)
     return areas if areas.any() else is_painted.astype(np.float32)
 
 
-def as_texels(u: Tensor) -> Tensor:
+def to_texels(u: Tensor) -> Tensor:
     """Return the texels (n, 3) that coordinates (3 n,) are."""
     return u.reshape(-1, 3)
 
 
-def recoloured(original: Tensor, centres: Tensor, budget: Budget) -> Painter:
+def make_palette_painter(original: Tensor, centers: Tensor, budget: Budget) -> Painter:
     """Return a painter that changes a few colors, and all texels that resemble them.
 
     Args:
         original: (n, 3) sRGB, the texels.
-        centres: (k, 3) sRGB, the original's palette.
+        centers: (k, 3) sRGB, the original's palette.
         budget: the ball around the palette.
     """
-    squared = (original[..., None, :] - centres).square().sum(dim=-1)
+    squared = (original[..., None, :] - centers).square().sum(dim=-1)
     # over which a color's influence falls off: half the mean distance to the nearest
     # other color
     spread = 1.0
-    if len(centres) > 1:
-        no_self = torch.diag(torch.full((len(centres),), 10.0))
-        distances = torch.cdist(centres, centres) + no_self
+    if len(centers) > 1:
+        no_self = torch.diag(torch.full((len(centers),), 10.0))
+        distances = torch.cdist(centers, centers) + no_self
         spread = max(0.5 * float(distances.min(dim=1).values.mean()), 1e-3)
     weights = torch.softmax(-squared / (2.0 * spread**2), dim=-1)
-    group = Group("palette", centres.numel(), ("adjoint", "differences"), budget)
-    texels = partial(_paint_palette, original, weights, centres)
-    return Painter(centres.reshape(-1), group, texels)
+    group = Group("palette", centers.numel(), ("adjoint", "differences"), budget)
+    texels = partial(_paint_palette, original, weights, centers)
+    return Painter(centers.reshape(-1), group, texels)
 
 
 def _paint_palette(
@@ -395,14 +397,16 @@ def _paint_palette(
     return (original.to(u.device) + change).clamp(0.0, 1.0)
 
 
-def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter:
+def make_wave_painter(
+    original: Tensor, mask: Tensor, count: int, radius: float
+) -> Painter:
     """Return a painter of cosine waves along both sides of the texture.
 
     Their sum is held inside a radius by a tanh.
 
     Args:
         original: (n, 3) sRGB.
-        where: (h, w) bool, the texels that are painted.
+        mask: (h, w) bool, the texels that are painted.
         count: number of waves along each side; wave m has m half periods, and the
             amplitude that a coordinate at the end of its range gives falls as 1 / (1 +
             the wave's frequency).
@@ -411,12 +415,12 @@ def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter
     index = torch.arange(count)
     down, right = (
         torch.cos(math.pi * (torch.arange(side) + 0.5)[:, None] * index / side)
-        for side in where.shape
+        for side in mask.shape
     )
     frequency = torch.hypot(index[:, None].float(), index[None, :].float())
     reach = (WAVE_REACH / (1.0 + frequency))[..., None]
     start = torch.full((count * count * 3,), 0.5)
-    texels = partial(_paint_waves, original, where, radius, (down, right, reach))
+    texels = partial(_paint_waves, original, mask, radius, (down, right, reach))
     return Painter(start, Group("amplitudes", len(start), ("adjoint",)), texels)
 
 
@@ -427,7 +431,7 @@ def _paint_waves(
     waves: tuple[Tensor, Tensor, Tensor],
     u: Tensor,
 ) -> Tensor:
-    """Return the texels (n, 3) with the waves of a slice u; see `waved`."""
+    """Return the texels (n, 3) with the waves of a slice u; see `make_wave_painter`."""
     down, right, reach = (wave.to(u.device) for wave in waves)
     amplitudes = (2.0 * u - 1.0).reshape(*reach.shape[:2], 3) * reach
     summed = torch.einsum("hm,wn,mnc->hwc", down, right, amplitudes)
@@ -435,7 +439,7 @@ def _paint_waves(
     return (original.to(u.device) + change).clamp(0.0, 1.0)
 
 
-def palette(image: Tensor, weight: Floats, count: int) -> Tensor:
+def compute_palette(image: Tensor, weight: Float32Array, count: int) -> Tensor:
     """Return the colors of an image by weighted k-means, heaviest first.
 
     Lloyd's algorithm on the image's 5-bit colors from a start without chance: the
@@ -466,7 +470,9 @@ def palette(image: Tensor, weight: Floats, count: int) -> Tensor:
     return torch.from_numpy(centers[order].clip(0.0, 1.0).astype(np.float32))
 
 
-def _quantise_colors(image: Tensor, weight: Floats) -> tuple[Doubles, Doubles]:
+def _quantise_colors(
+    image: Tensor, weight: Float32Array
+) -> tuple[Float64Array, Float64Array]:
     """Return the mean colors (N, 3) of the 5-bit cells of an image, and their mass (N,).
 
     The mass is the root of the summed weight, or else the shades of the largest surface
@@ -487,7 +493,9 @@ def _quantise_colors(image: Tensor, weight: Floats) -> tuple[Doubles, Doubles]:
     return points, np.sqrt(total[has_weight])
 
 
-def _choose_first_centers(points: Doubles, mass: Doubles, count: int) -> list[int]:
+def _choose_first_centers(
+    points: Float64Array, mass: Float64Array, count: int
+) -> list[int]:
     """Choose the indices of up to `count` points (N, 3) that k-means starts from."""
     chosen = [int(mass.argmax())]
     while len(chosen) < min(count, len(points)):

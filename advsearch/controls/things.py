@@ -38,24 +38,28 @@ from advsearch.extend import (
     parts,
 )
 
-GAP = 0.01  # metres between a thing that was moved away and what it would have stood in
-CAMERA = 0.3
-NEAR = 0.05
+MIN_GAP = (
+    0.01  # metres between a thing that was moved away and what it would have stood in
+)
+CAMERA_CLEARANCE = 0.3
+CAMERA_CLEARANCE_FRACTION = 0.05
 """Metres around the camera that stay free of what is as high; at most that share of its
 distance to the object.
 """
 EIGHTHS = np.arange(8) * np.pi / 4.0
-AWAY = 1e-5  # size of a thing that is away, and how many metres it lies in the ground
-SUNK = 0.01
+ABSENT_SCALE = (
+    1e-5  # size of a thing that is away, and how many metres it lies in the ground
+)
+ABSENT_DEPTH = 0.01
 _moving = partial(Parameter.moving, Parameter.ORBIT)
 
 
 class Stand(NamedTuple):
     """Where a thing stands, in the coordinates of the scene."""
 
-    position: assets.Doubles  # (2,) of its center
+    position: assets.Float64Array  # (2,) of its center
     height: float  # of the ground there
-    pushed: float  # how far it was moved away from the object
+    push_distance: float  # how far it was moved away from the object
 
 
 class ThingsControl(Control):
@@ -104,7 +108,7 @@ class ThingsControl(Control):
     )
 
     @classmethod
-    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+    def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the parameters for all things, and those set for one (`person.x`)."""
         parameter_by_name = {parameter.name: parameter for parameter in cls.parameters}
         single = []
@@ -138,27 +142,27 @@ class ThingsControl(Control):
         for slot in self.slots:
             thing, _, short_name = slot.parameter.name.rpartition(".")
             is_set = slot.parameter.name in self.specs or short_name in self.specs
-            if slot.width or is_set:
+            if slot.n_coordinates or is_set:
                 moved.add(thing)
         # the others stay, or another control moves them
         self._moved_things = tuple(name for name in things if name in moved)
         unmoved = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
         for name, stand in self._compute_stands(unmoved, {}).items():
-            if stand.pushed:
+            if stand.push_distance:
                 raise InputError(
                     f"`controls` {self.name}: {name} stands in something "
                     "else; put it elsewhere"
                 )
 
-    def laid_out(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
+    def list_parameter_specs(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
         """Yield the parameters of each thing, which those for all things apply to."""
         for thing in self.scene.things:
-            for parameter in map(self.in_scene, self.parameters):
+            for parameter in map(self.resolve_parameter, self.parameters):
                 name = f"{thing}.{parameter.name}"
-                spec = self.specs.get(name, self.spec(parameter))
+                spec = self.specs.get(name, self.get_spec(parameter))
                 yield replace(parameter, name=name), spec
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter, with a range of positions that is not larger than a table."""
         if parameter.name not in ("x", "y"):
             return parameter
@@ -186,21 +190,26 @@ class ThingsControl(Control):
             part = self.scene.meshes[name]
             base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
             foot = torch.from_numpy(_foot(part)).to(base)
-            turn = geometry.euler(values[f"{name}.heading"], *base.new_zeros(2))
+            turn = geometry.make_euler_rotation(
+                values[f"{name}.heading"], *base.new_zeros(2)
+            )
             is_absent = values[f"{name}.presence"]
             if is_absent:
-                turn = AWAY * turn
+                turn = ABSENT_SCALE * turn
             position = base.new_tensor([*stand.position, stand.height])
-            sunk = base.new_tensor([0.0, 0.0, SUNK / self.scene.metres]) * is_absent
+            sunk = (
+                base.new_tensor([0.0, 0.0, ABSENT_DEPTH / self.scene.metres])
+                * is_absent
+            )
             translation = position - sunk - turn @ foot
-            inputs[f"{name}.to_world"] = geometry.affine(turn, translation) @ base
+            inputs[f"{name}.to_world"] = geometry.make_affine(turn, translation) @ base
         return inputs
 
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return where each thing stands in the end, as the setting `things` has it."""
-        origin = geometry.middle(self.scene)[:2]
+        origin = geometry.compute_center(self.scene)[:2]
         measurements = {}
         for name, stand in self._compute_stands(values, so_far).items():
             x, y = (stand.position - origin) * self.scene.metres
@@ -216,7 +225,9 @@ class ThingsControl(Control):
         obstacles = self._list_obstacles(so_far)
         object_outline = obstacles[0].outline
         object_center = (object_outline.min(axis=0) + object_outline.max(axis=0)) / 2.0
-        solids = [solid for part in scene.around.values() for solid in part.solids]
+        solids = [
+            solid for part in scene.surrounding_meshes.values() for solid in part.solids
+        ]
         stands = {}
         for name in self._moved_things:
             base = _footprint(scene, name, so_far)
@@ -225,7 +236,7 @@ class ThingsControl(Control):
             )
             stands[name] = stand
             if not values[f"{name}.presence"]:
-                obstacles.append(parts.Footprint(outline, base.low, base.high))
+                obstacles.append(parts.Footprint(outline, base.lower, base.upper))
         return stands
 
     def _list_obstacles(self, so_far: Mapping[str, Tensor]) -> list[parts.Footprint]:
@@ -236,10 +247,12 @@ class ThingsControl(Control):
         scene = self.scene
         tested = _footprint(scene, "object", so_far)
         object_center = (tested.outline.min(axis=0) + tested.outline.max(axis=0)) / 2.0
-        camera = geometry.camera_in(scene, so_far)
+        camera = geometry.get_camera_pose(scene, so_far)
         eye = camera[:3, 3].detach().double().cpu().numpy()
         object_distance = float(np.linalg.norm(eye[:2] - object_center))
-        clearance = min(CAMERA / scene.metres, NEAR * object_distance)
+        clearance = min(
+            CAMERA_CLEARANCE / scene.metres, CAMERA_CLEARANCE_FRACTION * object_distance
+        )
         circle = np.stack([np.cos(EIGHTHS), np.sin(EIGHTHS)], axis=1)
         around_camera = parts.Footprint(
             eye[:2] + clearance * circle, eye[2], eye[2] + clearance
@@ -256,10 +269,10 @@ class ThingsControl(Control):
         name: str,
         values: Values,
         base: parts.Footprint,
-        object_center: assets.Doubles,
+        object_center: assets.Float64Array,
         obstacles: Sequence[parts.Footprint],
         solids: Sequence[parts.Solid],
-    ) -> tuple[Stand, assets.Doubles]:
+    ) -> tuple[Stand, assets.Float64Array]:
         """Find the free position of one thing, and its outline (K, 2) there.
 
         Args:
@@ -281,16 +294,18 @@ class ThingsControl(Control):
         direction = _unit_direction(requested - object_center)
         pushed = 0.0
         if not is_absent:
-            footprint = parts.Footprint(outline + requested, base.low, base.high)
-            gap = GAP / scene.metres
+            footprint = parts.Footprint(outline + requested, base.lower, base.upper)
+            gap = MIN_GAP / scene.metres
             pushed = _find_free_shift(footprint, direction, obstacles, solids, gap)
         position = requested + pushed * direction
-        height_above_ground = foot[2] - scene.ground_height(foot[:2])
-        height = height_above_ground + scene.ground_height(position)
+        height_above_ground = foot[2] - scene.get_ground_height(foot[:2])
+        height = height_above_ground + scene.get_ground_height(position)
         return Stand(position, height, pushed), outline + position
 
 
-def _rotate_outline(outline: assets.Doubles, degrees: float) -> assets.Doubles:
+def _rotate_outline(
+    outline: assets.Float64Array, degrees: float
+) -> assets.Float64Array:
     """Turn corners (K, 2) about the origin, counter-clockwise."""
     angle = np.radians(degrees)
     rotation = np.array(
@@ -299,7 +314,7 @@ def _rotate_outline(outline: assets.Doubles, degrees: float) -> assets.Doubles:
     return np.asarray(outline @ rotation.T)
 
 
-def _unit_direction(vector: assets.Doubles) -> assets.Doubles:
+def _unit_direction(vector: assets.Float64Array) -> assets.Float64Array:
     """Return the direction (2,) of a vector; +x for one of length 0."""
     if not vector.any():
         return np.array([1.0, 0.0])
@@ -308,7 +323,7 @@ def _unit_direction(vector: assets.Doubles) -> assets.Doubles:
 
 def _find_free_shift(
     footprint: parts.Footprint,
-    direction: assets.Doubles,
+    direction: assets.Float64Array,
     obstacles: Sequence[parts.Footprint],
     solids: Sequence[parts.Solid],
     gap: float,
@@ -323,10 +338,12 @@ def _find_free_shift(
         gap: that stays free.
     """
     in_solids = [
-        geometry.blocked(footprint, solid.footprint, direction) for solid in solids
+        geometry.find_overlap_interval(footprint, solid.footprint, direction)
+        for solid in solids
     ]
     in_obstacles = [
-        geometry.blocked(footprint, obstacle, direction) for obstacle in obstacles
+        geometry.find_overlap_interval(footprint, obstacle, direction)
+        for obstacle in obstacles
     ]
     shift = 0.0
     solid_begins = [begin for begin, end in in_solids if begin < 0.0 < end]
@@ -338,7 +355,7 @@ def _find_free_shift(
     return shift
 
 
-def _foot(part: parts.MeshPart) -> assets.Doubles:
+def _foot(part: parts.MeshPart) -> assets.Float64Array:
     """Return the point (3,) that a thing is put at and turned about.
 
     It is the center of its box, at the height of its lowest point.
@@ -364,9 +381,9 @@ def _footprint(
     matrix = part.to_world
     if pose is not None:
         matrix = pose.detach().cpu().double().numpy()
-    return geometry.footprint(vertices @ matrix[:3, :3].T + matrix[:3, 3])
+    return geometry.compute_footprint(vertices @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 @lru_cache(maxsize=256)
 def _initial_footprint(part: parts.MeshPart) -> parts.Footprint:
-    return geometry.footprint(geometry.standing(part))
+    return geometry.compute_footprint(geometry.compute_base_vertices(part))

@@ -23,18 +23,18 @@ from advsearch import seeds
 from advsearch.scene.renderer import Renderer
 
 # largest accepted mean difference of the margin over the views (of a classifier: logits)
-MARGIN = 0.3
-OF_MOVED = 0.05
+MAX_MARGIN_BIAS = 0.3
+MAX_BIAS_FRACTION = 0.05
 """The same as a fraction of what the search has moved the margin, where that is larger.
 
 So much affects the length of a step that is predicted, and not its direction.
 """
 # accepted root mean square over the object, in levels of 255, where a rendered image
 # has less noise
-BOUND = 2.0
+MIN_ALLOWED_LEVELS = 2.0
 # fraction of the allowed levels that is accepted, so that a prediction beyond the limit
 # seldom passes by chance
-ACCEPTED = 0.9
+ACCEPTED_FRACTION = 0.9
 CHECK_SPP = 16  # samples per pixel of each of the two traced images of a view
 
 
@@ -43,19 +43,19 @@ class ComparedView:
     """A predicted image compared with traced ones.
 
     Attributes:
-        square: mean squared error over the object, in levels of 255 squared; below 0
+        squared_error: mean squared error over the object, in levels of 255 squared; below 0
             by chance where it is small.
-        allowed: the same of a rendered image.
-        margin: by how much its margin is larger than the traced one.
-        pictures: images that were traced.
-        moved: by how much the search has moved the margin of predicted images.
+        allowed_squared_error: the same of a rendered image.
+        margin_bias: by how much its margin is larger than the traced one.
+        n_traced: images that were traced.
+        margin_change: by how much the search has moved the margin of predicted images.
     """
 
-    square: float
-    allowed: float
-    margin: float
-    pictures: int
-    moved: float = 0.0
+    squared_error: float
+    allowed_squared_error: float
+    margin_bias: float
+    n_traced: int
+    margin_change: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -64,76 +64,83 @@ class Deviation:
 
     Attributes:
         levels: root mean square over the object, in levels of 255.
-        logits: mean difference of the margin.
-        most: levels that are allowed.
-        pictures: images that were traced to measure it.
-        margin: difference of the margin that is allowed.
+        margin_bias: mean difference of the margin.
+        allowed_levels: levels that are allowed.
+        n_traced: images that were traced to measure it.
+        allowed_margin_bias: difference of the margin that is allowed.
     """
 
     levels: float
-    logits: float
-    most: float
-    pictures: int
-    margin: float = MARGIN
+    margin_bias: float
+    allowed_levels: float
+    n_traced: int
+    allowed_margin_bias: float = MAX_MARGIN_BIAS
 
     @classmethod
-    def of(cls, views: Sequence[ComparedView]) -> Deviation:
+    def from_views(cls, views: Sequence[ComparedView]) -> Deviation:
         """Return the deviation over several views."""
-        square = statistics.fmean(view.square for view in views)
-        allowed = statistics.fmean(view.allowed for view in views)
-        logits = statistics.fmean(view.margin for view in views)
-        moved = statistics.fmean(view.moved for view in views)
+        square = statistics.fmean(view.squared_error for view in views)
+        allowed = statistics.fmean(view.allowed_squared_error for view in views)
+        logits = statistics.fmean(view.margin_bias for view in views)
+        moved = statistics.fmean(view.margin_change for view in views)
         return cls(
             levels=_root(square),
-            logits=logits,
-            most=max(BOUND, _root(allowed)),
-            pictures=sum(view.pictures for view in views),
-            margin=max(MARGIN, OF_MOVED * moved),
+            margin_bias=logits,
+            allowed_levels=max(MIN_ALLOWED_LEVELS, _root(allowed)),
+            n_traced=sum(view.n_traced for view in views),
+            allowed_margin_bias=max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * moved),
         )
 
     @property
-    def share(self) -> float:
+    def levels_fraction(self) -> float:
         """The levels as a fraction of those that are allowed."""
-        return self.levels / self.most if self.most > 0.0 else math.inf
+        return (
+            self.levels / self.allowed_levels if self.allowed_levels > 0.0 else math.inf
+        )
 
     @property
-    def good(self) -> bool:
+    def is_accepted(self) -> bool:
         """Whether predictions may replace rendered images; False if anything is NaN."""
-        return self.share <= ACCEPTED and abs(self.logits) <= self.margin
+        return (
+            self.levels_fraction <= ACCEPTED_FRACTION
+            and abs(self.margin_bias) <= self.allowed_margin_bias
+        )
 
     @property
     def reason(self) -> str:
         """Why predictions may not replace rendered images, for a sentence."""
-        if not self.share <= ACCEPTED:
+        if not self.levels_fraction <= ACCEPTED_FRACTION:
             return (
                 f"{self.levels:.1f} levels of 255 off on the object, where "
-                f"{ACCEPTED * self.most:.1f} would do"
+                f"{ACCEPTED_FRACTION * self.allowed_levels:.1f} would do"
             )
-        return f"{self.logits:+.2f} off in the margin, where {self.margin:.2f} would do"
+        return f"{self.margin_bias:+.2f} off in the margin, where {self.allowed_margin_bias:.2f} would do"
 
 
-def compared(view: Callable[[int], ComparedView]) -> Deviation:
+def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
     """Compare predictions over several views, in few where these decide.
 
-    `view` compares a single view, by its index below `VIEWS`.
+    `compare_view` compares a single view, by its index below `N_VIEWS`.
     """
-    views = [view(index) for index in range(FIRST)]
-    first = Deviation.of(views)
-    margin_limit = CLEARLY_GOOD * first.margin
-    is_good = first.share <= CLEARLY_GOOD and abs(first.logits) <= margin_limit
-    if not is_good and first.share < CLEARLY_BAD:
-        views += [view(index) for index in range(FIRST, VIEWS)]
-    return Deviation.of(views)
+    views = [compare_view(index) for index in range(N_FIRST_VIEWS)]
+    first = Deviation.from_views(views)
+    margin_limit = CLEARLY_GOOD * first.allowed_margin_bias
+    is_good = (
+        first.levels_fraction <= CLEARLY_GOOD and abs(first.margin_bias) <= margin_limit
+    )
+    if not is_good and first.levels_fraction < CLEARLY_BAD:
+        views += [compare_view(index) for index in range(N_FIRST_VIEWS, N_VIEWS)]
+    return Deviation.from_views(views)
 
 
-def view_of(
+def compare_with_traced(
     renderer: Renderer,
     predicted: Tensor,
     u: Tensor,
     seed: int,
     spp: int,
-    margin: MarginOf,
-    before: Tensor | None = None,
+    measure_margin: MeasureMargin,
+    predicted_start: Tensor | None = None,
 ) -> ComparedView:
     """Compare a predicted image with traced images of the same configuration.
 
@@ -143,29 +150,29 @@ def view_of(
         u: (d,) full configuration.
         seed: of the noise of the traced images.
         spp: samples per pixel of the search.
-        margin: from an image and a configuration to the model's margin.
-        before: (H, W, 3) image that was predicted in its place before the search, if
+        measure_margin: from an image and a configuration to the model's margin.
+        predicted_start: (H, W, 3) image that was predicted in its place before the search, if
             there was one.
     """
     with torch.no_grad():
         rendered = renderer(u, seeds.stream(seed, "rendered"), spp)
-        *halves, converged = renderer.halves(u, seed, CHECK_SPP)
+        *halves, converged = renderer.render_halves(u, seed, CHECK_SPP)
         object_mask = renderer.mask(u)
-    predicted_margin = margin(predicted, u)
+    predicted_margin = measure_margin(predicted, u)
     moved = 0.0
-    if before is not None:
-        moved = abs(predicted_margin - margin(before, u))
+    if predicted_start is not None:
+        moved = abs(predicted_margin - measure_margin(predicted_start, u))
     return ComparedView(
-        square=squares_off(predicted, halves, object_mask),
-        allowed=squares_off(rendered, halves, object_mask),
-        margin=predicted_margin - margin(converged, u),
-        pictures=3,
-        moved=moved,
+        squared_error=compute_squared_error(predicted, halves, object_mask),
+        allowed_squared_error=compute_squared_error(rendered, halves, object_mask),
+        margin_bias=predicted_margin - measure_margin(converged, u),
+        n_traced=3,
+        margin_change=moved,
     )
 
 
-def squares_off(
-    picture: Tensor, halves: Sequence[Tensor], seen: Tensor | None = None
+def compute_squared_error(
+    image: Tensor, halves: Sequence[Tensor], mask: Tensor | None = None
 ) -> float:
     """Return the mean squared error of an image without the noise of its reference.
 
@@ -174,29 +181,29 @@ def squares_off(
     without the denoiser, which leaves marks of its own in every image.
 
     Args:
-        picture: (H, W, 3) image.
+        image: (H, W, 3) image.
         halves: two traced images (H, W, 3).
-        seen: (H, W) mask of the pixels that count; all do if None, or if it is empty.
+        mask: (H, W) mask of the pixels that count; all do if None, or if it is empty.
 
     Returns:
         The error in levels of 255, squared.
     """
     first, second = halves
-    products = (picture - first) * (picture - second)
-    if seen is not None and bool(seen.any()):
-        products = products[seen]
+    products = (image - first) * (image - second)
+    if mask is not None and bool(mask.any()):
+        products = products[mask]
     return 255.0**2 * float(products.mean())
 
 
-def levels_off(
-    renderer: Renderer, pictures: Sequence[Tensor], u: Tensor, seed: int, spp: int
+def compute_level_errors(
+    renderer: Renderer, images: Sequence[Tensor], u: Tensor, seed: int, spp: int
 ) -> list[float]:
     """Return the root-mean-square error of full images (H, W, 3), in levels of 255.
 
     All are of the configuration u (d,).
     """
-    halves = renderer.halves(u, seed, spp)[:2]
-    return [_root(squares_off(picture, halves)) for picture in pictures]
+    halves = renderer.render_halves(u, seed, spp)[:2]
+    return [_root(compute_squared_error(picture, halves)) for picture in images]
 
 
 def _root(square: float) -> float:
@@ -204,10 +211,10 @@ def _root(square: float) -> float:
     return 0.0 if square <= 0.0 else math.sqrt(square)
 
 
-FIRST = 2  # views that are compared at first
-VIEWS = 6  # views that are compared where the first do not decide
+N_FIRST_VIEWS = 2  # views that are compared at first
+N_VIEWS = 6  # views that are compared where the first do not decide
 # fractions of what is allowed up to which, and from which on, the first views decide
 CLEARLY_GOOD = 0.7
 CLEARLY_BAD = 1.4
-MarginOf = Callable[[Tensor, Tensor], float]
+MeasureMargin = Callable[[Tensor, Tensor], float]
 """The margin of what a model says of a picture (H, W, 3) of a configuration (d,)."""

@@ -17,42 +17,52 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
-from advsearch.attacks.domain import Domain, Draws
+from advsearch.attacks.domain import Domain, SampleSequence
 from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.policies.sampling import to_domain
 from advsearch.engine.acceptance import ComparedView
 from advsearch.engine.transport import PredictedSearch
 from advsearch.runs.results import BankOfConditions
-from advsearch.scene.color import to_8_bit
-from advsearch.scene.predictor import MOST_BYTES
-from advsearch.scene.transport.matrix import Linearised, LinearRenderer, Tick
+from advsearch.scene.color import round_to_8_bit
+from advsearch.scene.predictor import MAX_BYTES
+from advsearch.scene.transport.matrix import (
+    LinearizedScene,
+    LinearRenderer,
+    ProgressCallback,
+)
 from advsearch.trust.stored_files import scaled
 
-FIRST = 8  # conditions in the bank at first, as a multiple of those of an evaluation
-GROWTH = 4  # conditions that are drawn for each that is added, while the bank grows
-EVERY = 100  # evaluations from one comparison to the next
+INITIAL_CONDITIONS = (
+    8  # conditions in the bank at first, as a multiple of those of an evaluation
+)
+DRAWS_PER_CONDITION = (
+    4  # conditions that are drawn for each that is added, while the bank grows
+)
+COMPARISON_INTERVAL = 100  # evaluations from one comparison to the next
 # conditions that a comparison traces, and as many of the bank that it predicts
-UNSEEN = 16
-SURE = 1.0  # standard errors by which unseen conditions must be better for the model
+N_COMPARED = 16
+MIN_STANDARD_ERRORS = (
+    1.0  # standard errors by which unseen conditions must be better for the model
+)
 SPP = 4  # samples per pixel of a condition's light (see `problem.LIGHT_DEPTH`)
-TOGETHER = 16  # images in a batch of the model
-SOBOL_MOST = 64  # coordinates of a condition up to which conditions are stratified
+BATCH_SIZE = 16  # images in a batch of the model
+MAX_SOBOL_DIM = 64  # coordinates of a condition up to which conditions are stratified
 
 
-def stratified(domain: Domain, number: int, seed: int) -> Tensor:
+def sample_condition(domain: Domain, index: int, seed: int) -> Tensor:
     """Return the condition (d,) with an index, far from those before it.
 
     By itself it is as likely as any other: a point of a scrambled Sobol sequence, or an
     independent sample where the sequence cannot be used.
     """
     has_l2_block = any(block.norm == "l2" for block in domain.blocks)
-    if domain.dim > SOBOL_MOST or has_l2_block:
+    if domain.dim > MAX_SOBOL_DIM or has_l2_block:
         generator = torch.Generator().manual_seed(
-            seeds.stream(seed, "bank condition", number)
+            seeds.stream(seed, "bank condition", index)
         )
         return domain.sample(generator)[0]
-    sequence = Draws(domain.dim, "sobol", seed, "bank conditions")
-    point = sequence.points(number, 1)[0]
+    sequence = SampleSequence(domain.dim, "sobol", seed, "bank conditions")
+    point = sequence.points(index, 1)[0]
     return to_domain(domain, torch.from_numpy(point).float())
 
 
@@ -61,16 +71,16 @@ class Condition:
     """A condition of the bank, and its matrix.
 
     Attributes:
-        number: its index in the bank's sequence.
-        numbers: (d,) coordinates of the condition.
+        index: its index in the bank's sequence.
+        u: (d,) coordinates of the condition.
         renderer: predicts images under it.
-        alone: whether base colors under it depend only on what is searched.
+        depends_on_searched_only: whether base colors under it depend only on what is searched.
     """
 
-    number: int
-    numbers: Tensor
+    index: int
+    u: Tensor
     renderer: LinearRenderer
-    alone: bool
+    depends_on_searched_only: bool
 
 
 @dataclass
@@ -79,15 +89,15 @@ class Bank(PredictedSearch):
 
     Attributes:
         trace: collects the light of conditions, on workers where there are some.
-        grown: evaluations whose comparison let the bank go on growing.
+        growth_steps: evaluations whose comparison let the bank go on growing.
         gaps: of each comparison, by how much the objective was larger under conditions
             of the bank than under unseen ones.
     """
 
     trace: Evaluate
-    drawn: bool = field(default=True, kw_only=True)
-    renewed: int | None = field(default=None, kw_only=True)
-    grown: list[int] = field(default_factory=list)
+    draws_conditions: bool = field(default=True, kw_only=True)
+    n_renewals: int | None = field(default=None, kw_only=True)
+    growth_steps: list[int] = field(default_factory=list)
     gaps: list[float] = field(default_factory=list)
     # conditions in memory, the newest last
     _conditions: list[Condition] = field(default_factory=list)
@@ -104,73 +114,69 @@ class Bank(PredictedSearch):
     _n_dropped: int = 0
 
     @property
-    def samples(self) -> int:
+    def n_samples(self) -> int:
         return self._bank_size(0) * SPP
 
-    def size(self) -> tuple[int, int]:
-        entries = sum(condition.renderer.entries for condition in self._conditions)
+    def measure_size(self) -> tuple[int, int]:
+        entries = sum(condition.renderer.n_entries for condition in self._conditions)
         return entries, self._bytes
 
-    def conditions(self) -> BankOfConditions:
+    def summarize_conditions(self) -> BankOfConditions:
         return BankOfConditions(
             made=self._bank_size(self._latest_step),
             dropped=self._n_dropped,
-            grown=len(self.grown),
+            grown=len(self.growth_steps),
             gap=self.gaps[-1] if self.gaps else None,
         )
 
-    def prepare(self, tick: Tick = lambda samples: None) -> None:
+    def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
         self._fill(0, tick)
 
-    def passed(self, query: Query) -> None:
+    def replay(self, query: Query) -> None:
         """Compare where that is due, and make the matrices that exist by then."""
         if query.kind == "search" and query.phase == "search":
             self._latest_step = query.number
-            if query.number and query.number % EVERY == 0:
+            if query.number and query.number % COMPARISON_INTERVAL == 0:
                 self._compare(query.u, query.number)
         self._fill(self._latest_step)
-        if query.keep:
+        if query.with_image:
             # It has the same noise whenever it is rendered.
             self._render_image(query.u)
 
     def evaluate(self, query: Query) -> Evaluation:
-        self.passed(query)
+        self.replay(query)
         conditions = self._choose_conditions(query.kind, query.number)
         evaluation = self._evaluate_under(conditions, query.u, query.gradient)
-        if not query.keep:
+        if not query.with_image:
             return evaluation
-        return replace(evaluation, picture=to_8_bit(self._render_image(query.u)))
+        return replace(evaluation, picture=round_to_8_bit(self._render_image(query.u)))
 
     def _evaluate_under(
         self, conditions: Sequence[Condition], u: Tensor, gradient: WhichGradient
     ) -> Evaluation:
         """Evaluate u (d,) under conditions of the bank."""
-        full_configurations = [
-            torch.cat([u, condition.numbers]) for condition in conditions
-        ]
-        evaluation = self.problem.mean_under(
+        full_configurations = [torch.cat([u, condition.u]) for condition in conditions]
+        evaluation = self.problem.evaluate_conditions(
             lambda batch, batch_u: self._predict_images(conditions[batch], batch_u),
             full_configurations,
             u,
             gradient,
-            TOGETHER,
+            BATCH_SIZE,
         )
         return replace(evaluation, predicted=1)
 
     def _choose_conditions(self, kind: str, index: int) -> list[Condition]:
         """Return the conditions of an evaluation: all new ones, and random others."""
-        count = min(self.problem.draws, len(self._conditions))
+        count = min(self.problem.n_draws, len(self._conditions))
         previous_index = index - 1 if kind == "search" else self._latest_step
         size_before = self._bank_size(previous_index)
         new = [
             condition
             for condition in self._conditions
-            if condition.number >= size_before
+            if condition.index >= size_before
         ][:count]
         old = [
-            condition
-            for condition in self._conditions
-            if condition.number < size_before
+            condition for condition in self._conditions if condition.index < size_before
         ]
         return new + self._sample(old, count - len(new), f"bank {kind}", index)
 
@@ -189,11 +195,11 @@ class Bank(PredictedSearch):
         inputs = self.problem.searched_space.inputs(u)
         images = []
         for condition in conditions:
-            full_u = torch.cat([u, condition.numbers])
+            full_u = torch.cat([u, condition.u])
             renderer = condition.renderer
-            if condition.alone:
-                color_inputs = {name: inputs[name] for name in renderer.there}
-                images.append(renderer.shown(color_inputs, full_u))
+            if condition.depends_on_searched_only:
+                color_inputs = {name: inputs[name] for name in renderer.linearized_at}
+                images.append(renderer.predict_image(color_inputs, full_u))
             else:
                 images.append(renderer(full_u))
         return torch.stack(images)
@@ -202,21 +208,24 @@ class Bank(PredictedSearch):
         """Return the image (H, W, 3) of u (d,) without random conditions."""
         if self._image_renderer is None:
             seed = seeds.stream(self.problem.seed, "bank still")
-            start = self.problem.whole(self.problem.domain.start)
-            self._image_renderer = self.problem.linearised(start, seed, SPP)
-            self.traced += 1
+            start = self.problem.add_conditions(self.problem.domain.start)
+            self._image_renderer = self.problem.make_linear_renderer(start, seed, SPP)
+            self.n_traced += 1
         with torch.no_grad():
-            return self._image_renderer(self.problem.whole(u))
+            return self._image_renderer(self.problem.add_conditions(u))
 
     def _bank_size(self, index: int) -> int:
         """Return how many conditions are collected by the evaluation with an index."""
         # The second half of a search adds none.
         index = min(index, self.steps // 2 - 1)
         n_growing_steps = sum(
-            min(max(index - begin + 1, 0), EVERY) for begin in (0, *self.grown)
+            min(max(index - begin + 1, 0), COMPARISON_INTERVAL)
+            for begin in (0, *self.growth_steps)
         )
-        draws = self.problem.draws
-        return FIRST * draws + n_growing_steps * draws // GROWTH
+        draws = self.problem.n_draws
+        return (
+            INITIAL_CONDITIONS * draws + n_growing_steps * draws // DRAWS_PER_CONDITION
+        )
 
     def _make_query(self, number: int) -> Query:
         """Return the query for the light of the condition with an index.
@@ -224,25 +233,29 @@ class Bank(PredictedSearch):
         The light is collected where the search was when the bank last began to grow.
         """
         assert self.problem.conditions is not None
-        starts = [begin for begin in self.grown if self._bank_size(begin - 1) <= number]
+        starts = [
+            begin for begin in self.growth_steps if self._bank_size(begin - 1) <= number
+        ]
         u = self._grown_at[starts[-1]] if starts else self.problem.domain.start
         bank_seed = seeds.stream(self.problem.seed, "bank")
-        condition = stratified(self.problem.conditions, number, bank_seed)
+        condition = sample_condition(self.problem.conditions, number, bank_seed)
         seed = seeds.stream(self.problem.seed, "bank matrix", number)
-        return Query(torch.cat([u, condition]), seed, spp=SPP, wanted="light")
+        return Query(torch.cat([u, condition]), seed, spp=SPP, product="light")
 
-    def _fill(self, index: int, tick: Tick = lambda samples: None) -> None:
+    def _fill(self, index: int, tick: ProgressCallback = lambda samples: None) -> None:
         """Make the matrices of all conditions up to an evaluation, the newest last.
 
         The oldest are dropped where memory is short.
         """
         size = self._bank_size(index)
-        first = self._conditions[-1].number + 1 if self._conditions else 0
+        first = self._conditions[-1].index + 1 if self._conditions else 0
         if first >= size:
             return
-        with self.timed():
+        with self.count_time():
             if self._collected_until <= first:
-                next_comparison = (index // EVERY + 1) * EVERY
+                next_comparison = (
+                    index // COMPARISON_INTERVAL + 1
+                ) * COMPARISON_INTERVAL
                 self._collected_until = self._bank_size(next_comparison - 1)
                 queries = [
                     self._make_query(number)
@@ -252,22 +265,22 @@ class Bank(PredictedSearch):
             for number in range(first, size):
                 condition = self._make_condition(number, next(self._incoming).light)
                 self._conditions.append(condition)
-                self._bytes += condition.renderer.bytes
+                self._bytes += condition.renderer.n_bytes
                 tick(SPP)
-                while len(self._conditions) > 1 and self._bytes > scaled(MOST_BYTES):
-                    self._bytes -= self._conditions.pop(0).renderer.bytes
+                while len(self._conditions) > 1 and self._bytes > scaled(MAX_BYTES):
+                    self._bytes -= self._conditions.pop(0).renderer.n_bytes
                     self._n_dropped += 1
 
-    def _make_condition(self, number: int, light: Linearised | None) -> Condition:
+    def _make_condition(self, number: int, light: LinearizedScene | None) -> Condition:
         """Return the condition with an index, with the matrix of its light."""
         query = self._make_query(number)
         dim = self.problem.domain.dim
-        renderer = self.problem.linearised(query.u, query.seed, SPP, light)
-        self.traced += 1
+        renderer = self.problem.make_linear_renderer(query.u, query.seed, SPP, light)
+        self.n_traced += 1
         with torch.no_grad():
             searched_inputs = self.problem.searched_space.inputs(query.u[:dim])
         depends_on_searched_only = True
-        for name, value in renderer.there.items():
+        for name, value in renderer.linearized_at.items():
             if name not in searched_inputs or not torch.equal(
                 searched_inputs[name], value
             ):
@@ -275,8 +288,8 @@ class Bank(PredictedSearch):
             latest = self._latest_inputs.get(name)
             if latest is not None and torch.equal(latest, value):
                 # Equal inputs of all matrices share one tensor.
-                renderer.there[name] = latest
-        self._latest_inputs = dict(renderer.there)
+                renderer.linearized_at[name] = latest
+        self._latest_inputs = dict(renderer.linearized_at)
         return Condition(number, query.u[dim:], renderer, depends_on_searched_only)
 
     def _compare(self, u: Tensor, index: int) -> None:
@@ -286,21 +299,21 @@ class Bank(PredictedSearch):
         bank, or if predictions are too far from traced images.
         """
         problem = self.problem
-        with self.timed():
+        with self.count_time():
             seed = seeds.stream(problem.seed, "bank check", index)
             unseen_objectives = self._trace_unseen(u, seed)
-            conditions = self._sample(self._conditions, UNSEEN, "bank check", index)
+            conditions = self._sample(self._conditions, N_COMPARED, "bank check", index)
             full_configurations = [
-                torch.cat([u, condition.numbers]) for condition in conditions
+                torch.cat([u, condition.u]) for condition in conditions
             ]
-            evaluated, _ = problem.judged(
+            evaluated, _ = problem.evaluate_batch(
                 partial(self._predict_images, conditions), full_configurations, u, False
             )
             bank_objectives = [evaluation.objective for evaluation, _ in evaluated]
             bank_mean = statistics.fmean(bank_objectives)
             gap = bank_mean - statistics.fmean(unseen_objectives)
             self.gaps.append(gap)
-            self.traced += UNSEEN
+            self.n_traced += N_COMPARED
             standard_error = math.sqrt(
                 sum(
                     statistics.pvariance(objectives) / len(objectives)
@@ -310,25 +323,25 @@ class Bank(PredictedSearch):
 
         def compare_view(number: int) -> ComparedView:
             position = number % len(conditions)
-            return problem.view(
+            return problem.compare_view(
                 conditions[position].renderer,
                 full_configurations[position],
                 seeds.stream(seed, "view", number),
                 SPP,
             )
 
-        is_accurate = self.compare(compare_view).good
-        if not is_accurate or gap > SURE * standard_error:
+        is_accurate = self.compare(compare_view).is_accepted
+        if not is_accurate or gap > MIN_STANDARD_ERRORS * standard_error:
             self._grown_at[index] = u.detach().clone()
-            self.grown.append(index)
+            self.growth_steps.append(index)
 
     def _trace_unseen(self, u: Tensor, seed: int) -> list[float]:
         """Return the objectives of u (d,) under conditions that are not in the bank."""
         objectives = []
-        for index in range(UNSEEN):
+        for index in range(N_COMPARED):
             draw = seeds.stream(seed, "draw", index)
-            evaluation, _ = self.problem.evaluated(
-                Query(u, draw), self.problem.whole(u, draw), draw
+            evaluation, _ = self.problem.evaluate_full(
+                Query(u, draw), self.problem.add_conditions(u, draw), draw
             )
             objectives.append(evaluation.objective)
         return objectives

@@ -42,7 +42,7 @@ def _shift(image: Tensor) -> Tensor:
     return torch.cat([image[:, :1], image[:, :-1]], dim=1)
 
 
-CHANGED: dict[str, Callable[[Tensor], Tensor]] = {
+IMAGE_CHANGES: dict[str, Callable[[Tensor], Tensor]] = {
     "black": torch.zeros_like,
     "covered": _cover,
     "exposure": _brighten,
@@ -50,22 +50,22 @@ CHANGED: dict[str, Callable[[Tensor], Tensor]] = {
     "jpeg": _compress,
 }
 """Functions from an image (H, W, 3), sRGB in [0, 1], to the changed image, by name."""
-AWAY = "away"  # the change that renders the scene again, without the object
+WITHOUT_OBJECT = "away"  # the change that renders the scene again, without the object
 # largest change of a label's probability that counts as none
-ALIKE = 0.1
+MAX_UNCHANGED_DIFFERENCE = 0.1
 
 
-def changed(picture: Tensor, when: str, cameras: int = 1) -> Tensor:
-    """Return an image (H, W, 3) with a change of `CHANGED`.
+def change_image(image: Tensor, change_name: str, n_cameras: int = 1) -> Tensor:
+    """Return an image (H, W, 3) with a change of `IMAGE_CHANGES`.
 
     The images of several cameras stand side by side, and each is changed by itself.
     """
-    change = CHANGED[when]
-    images = picture.chunk(cameras, dim=1)
+    change = IMAGE_CHANGES[change_name]
+    images = image.chunk(n_cameras, dim=1)
     return torch.cat([change(image) for image in images], dim=1)
 
 
-def as_claimed(claim: str, before: Prediction, after: Prediction) -> bool:
+def meets_claim(claim: str, before: Prediction, after: Prediction) -> bool:
     """Return whether a change of the image did what a claim states.
 
     The claim is that the prediction "must_change", or "must_not_change".
@@ -74,4 +74,4 @@ def as_claimed(claim: str, before: Prediction, after: Prediction) -> bool:
     if claim != "must_change":
         return not has_other_label
     difference = abs((before.probability or 0.0) - (after.probability or 0.0))
-    return has_other_label or difference > ALIKE
+    return has_other_label or difference > MAX_UNCHANGED_DIFFERENCE

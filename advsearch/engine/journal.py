@@ -26,14 +26,19 @@ from torch import Tensor
 
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.cluster import Call, Workers, WorkerStats
-from advsearch.engine.problem import Prepared, Problem
-from advsearch.engine.record import LOST, judged, judgement_of, trial_row
+from advsearch.cluster import BatchFunction, Workers, WorkerStats
+from advsearch.engine.problem import Preparation, Problem
+from advsearch.engine.record import (
+    LOST_LABEL,
+    add_judgement,
+    make_trial_row,
+    read_judgement,
+)
 from advsearch.errors import ClusterError, InputError
 from advsearch.models import Model, RemoteNetwork
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
-from advsearch.scene.color import levels_of
+from advsearch.scene.color import to_uint8
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.together import Ensemble
 
@@ -41,72 +46,72 @@ ProblemKey = str | float
 """Identifies a problem among those of workers: its name, or the factor of its ambient
 light.
 """
-Sent: TypeAlias = tuple[ProblemKey, Prepared | None, Query]
+WorkItem: TypeAlias = tuple[ProblemKey, Preparation | None, Query]
 """What a worker gets: the key of a problem, its preparation, and a query."""
 
 
-class Answerer(Protocol):
+class Evaluator(Protocol):
     """Evaluates queries: a `Problem`, or a scene of a sweep."""
 
     def evaluate_all(
-        self, queries: Sequence[Query], prepared: Prepared | None = None
+        self, queries: Sequence[Query], preparation: Preparation | None = None
     ) -> Iterable[Evaluation]:
         """Evaluate queries in order; see `advsearch.attacks.evaluation.Evaluate`.
 
-        `prepared` is the preparation of the problem that sends them.
+        `preparation` is the preparation of the problem that sends them.
         """
 
 
 @dataclass
-class Shared:
+class ParallelEvaluator:
     """Evaluates the queries of a problem, several at once where there are workers.
 
     Attributes:
-        own: the problem; None of a sweep, which has one for each scene and model.
-        executor: workers that run `worker_call`; None to evaluate in this process.
-        name: identifies the problem among those of workers.
+        optional_problem: the problem; None of a sweep, which has one for each scene and model.
+        executor: workers that run `make_worker_call`; None to evaluate in this process.
+        key: identifies the problem among those of workers.
     """
 
-    own: Problem | None
+    optional_problem: Problem | None
     executor: Workers | None = None
-    name: ProblemKey = ""
+    key: ProblemKey = ""
 
     @property
     def problem(self) -> Problem:
-        if self.own is None:
+        if self.optional_problem is None:
             raise RuntimeError(
                 "a sweep has a problem for each scene and model, and none of its own"
             )
-        return self.own
+        return self.optional_problem
 
     @property
-    def facts(self) -> WorkerStats | None:
+    def worker_stats(self) -> WorkerStats | None:
         """Statistics of the workers; None without workers."""
-        return None if self.executor is None else self.executor.facts
+        return None if self.executor is None else self.executor.stats
 
     @property
-    def told(self) -> dict[str, float | str]:
+    def progress_stats(self) -> dict[str, float | str]:
         """Statistics of the workers for a progress bar."""
-        return {} if self.facts is None else self.facts.told
+        return {} if self.worker_stats is None else self.worker_stats.progress_counts
 
     def __call__(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Evaluate queries, and yield the evaluations in the order of the queries."""
         if self.executor is None or len(queries) < 2:
             yield from map(self.problem.evaluate, queries)
             return
-        items: list[Sent] = [
-            (self.name, self.problem.prepared, query) for query in queries
+        items: list[WorkItem] = [
+            (self.key, self.problem.preparation, query) for query in queries
         ]
         index_of_item = {id(item): index for index, item in enumerate(items)}
         # evaluations that came before those of earlier queries
         waiting = dict[int, Evaluation]()
         next_index = 0
-        results: Any = self.executor.results([item] for item in items)
+        results: Any = self.executor.compute([item] for item in items)
         with closing(results):
             for result in results:
                 index = index_of_item[id(result.items[0])]
                 if result.lost:
-                    evaluation = lost(queries[index], result.lost)
+                    evaluation = make_lost_evaluation(queries[index], result.lost)
                 else:
                     evaluation = result.value[0]
                 waiting[index] = replace(evaluation, machine=result.machine)
@@ -117,37 +122,37 @@ class Shared:
                     next_index += 1
 
 
-def worker_call(named: Callable[[Any], Answerer]) -> Call:
+def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction:
     """Return the function that a worker runs on queries that were sent to it.
 
-    `named` returns the problem of a key.
+    `get_evaluator` returns the problem of a key.
     """
 
-    def call(items: Sequence[Sent]) -> list[Evaluation]:
+    def call(items: Sequence[WorkItem]) -> list[Evaluation]:
         evaluations = list[Evaluation]()
         for key, group in groupby(items, lambda item: item[0]):
             items_of_problem = list(group)
             # All are sent together, so that they have the same preparation.
             _, prepared, _ = items_of_problem[0]
             queries = [query for _, _, query in items_of_problem]
-            evaluations += named(key).evaluate_all(queries, prepared)
+            evaluations += get_evaluator(key).evaluate_all(queries, prepared)
         return evaluations
 
     return call
 
 
-def lost(query: Query, why: str) -> Evaluation:
+def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
     """Return the evaluation of a query whose workers all died.
 
     Raises:
         ClusterError: the query is for an image or for light, which nothing replaces.
     """
-    if query.wanted != "judgement":
+    if query.product != "judgement":
         product = (
-            "a picture" if query.wanted == "picture" else "the light of a condition"
+            "a picture" if query.product == "picture" else "the light of a condition"
         )
         raise ClusterError(
-            f"{product}: {why}; `advsearch resume RUN workers=null` makes it here"
+            f"{product}: {reason}; `advsearch resume RUN workers=null` makes it here"
         )
     gradient = torch.zeros_like(query.u) if query.gradient else None
     cost = 0 if query.phase is None else query.samples
@@ -155,18 +160,18 @@ def lost(query: Query, why: str) -> Evaluation:
         math.nan,
         math.nan,
         right=False,
-        prediction=Prediction(LOST, None, None),
-        payload={"lost": why},
+        prediction=Prediction(LOST_LABEL, None, None),
+        payload={"lost": reason},
     )
     return Evaluation(
-        math.nan, gradient, False, cost=cost, judgement=judgement, lost=True
+        math.nan, gradient, False, cost=cost, judgement=judgement, is_lost=True
     )
 
 
-MADE_OF = "made of"  # the note that has the digests of functions and weights
+DIGESTS_NOTE = "made of"  # the note that has the digests of functions and weights
 
 
-def check_made_of(
+def check_digests(
     run: RunDirectory,
     models: Sequence[Model],
     functions: Mapping[str, Callable[..., Any] | None] | None = None,
@@ -185,18 +190,18 @@ def check_made_of(
             networks = model.module.models
         for network in networks:
             if isinstance(network.module, RemoteNetwork):
-                network.module.keep_in(run.store)
-            digests[f"model {network.name}"] = weights_digest(network)
+                network.module.store_answers_in(run.store)
+            digests[f"model {network.name}"] = compute_weights_digest(network)
     for name, function in (functions or {}).items():
         if function is not None:
-            digests[name] = code_digest(function)
+            digests[name] = compute_code_digest(function)
     known_digests = {
         name: digest for name, digest in digests.items() if digest is not None
     }
-    run.check_unchanged(MADE_OF, known_digests)
+    run.check_unchanged(DIGESTS_NOTE, known_digests)
 
 
-def weights_digest(model: Model) -> str | None:
+def compute_weights_digest(model: Model) -> str | None:
     """Return the SHA-256 of a network's weights and buffers, with their names.
 
     None for a network that does not give access to them.
@@ -216,7 +221,7 @@ def weights_digest(model: Model) -> str | None:
     return digest.hexdigest() if tensors else None
 
 
-def code_digest(function: Callable[..., Any]) -> str | None:
+def compute_code_digest(function: Callable[..., Any]) -> str | None:
     """Return the SHA-256 of what a function does; None if it has no Python code.
 
     It covers code, constants, defaults and closures; of an object that is called as a
@@ -284,8 +289,8 @@ def _simplify(value: Any) -> Any:
     return type(value).__name__
 
 
-MACHINES = "machines"  # the note that describes machines unlike this one
-PLAN = "gradient plan"  # the note of how derivatives are computed
+MACHINES_NOTE = "machines"  # the note that describes machines unlike this one
+PLAN_NOTE = "gradient plan"  # the note of how derivatives are computed
 
 
 @dataclass
@@ -294,17 +299,17 @@ class Journal:
 
     Attributes:
         run: directory whose store has the rows; None to hold them in `rows`.
-        traced: evaluates queries that nothing predicts.
+        evaluator: evaluates queries that nothing predicts.
         rows: of a journal without a run directory.
-        lost: queries whose workers all died.
+        n_lost: queries whose workers all died.
         machines: description of the machines that are not like this one, by the names
             in rows.
     """
 
     run: RunDirectory | None
-    traced: Shared
+    evaluator: ParallelEvaluator
     rows: list[Row] = field(default_factory=list)
-    lost: int = 0
+    n_lost: int = 0
     machines: dict[str, dict[str, str]] = field(default_factory=dict)
     _counts: dict[str, int] = field(default_factory=dict)
     _trials: dict[str, dict[int, Evaluation]] = field(default_factory=dict)
@@ -313,12 +318,12 @@ class Journal:
     @property
     def problem(self) -> Problem:
         """The problem whose queries are evaluated."""
-        return self.traced.problem
+        return self.evaluator.problem
 
     def __post_init__(self) -> None:
         # once, and not for another problem of the same run
         if self.run is not None and not self._opened:
-            self.machines |= self.note(MACHINES) or {}
+            self.machines |= self.get_note(MACHINES_NOTE) or {}
             self._counts |= self.run.store.counts()
             self._opened = True
 
@@ -328,7 +333,7 @@ class Journal:
         self,
         queries: Sequence[Query],
         evaluate: Evaluate | None = None,
-        passed: Callable[[Query], None] = lambda query: None,
+        on_replay: Callable[[Query], None] = lambda query: None,
     ) -> Iterator[Evaluation]:
         """Yield the evaluations of queries in their order, from the store or new ones.
 
@@ -337,7 +342,7 @@ class Journal:
         Args:
             queries: in order.
             evaluate: evaluates those that are not stored; None for `traced`.
-            passed: called with every query of a search that is read from the store.
+            on_replay: called with every query of a search that is read from the store.
         """
         stored = [self._read(query) for query in queries]
         new_queries = [
@@ -345,7 +350,7 @@ class Journal:
             for query, evaluation in zip(queries, stored, strict=True)
             if evaluation is None
         ]
-        evaluate = self.traced if evaluate is None else evaluate
+        evaluate = self.evaluator if evaluate is None else evaluate
         new_evaluations = iter(evaluate(new_queries))
         for query, evaluation in zip(queries, stored, strict=True):
             started = time.perf_counter()
@@ -354,9 +359,9 @@ class Journal:
                 seconds = None
                 if query.phase is not None:
                     seconds = time.perf_counter() - started
-                self.keep([(query, replace(evaluation, seconds=seconds))])
+                self.store([(query, replace(evaluation, seconds=seconds))])
             elif query.phase is not None:
-                passed(query)
+                on_replay(query)
             yield evaluation
 
     def _trials_of(self, kind: str) -> dict[int, Evaluation]:
@@ -371,10 +376,13 @@ class Journal:
             # Rows of old runs may have no judgement.
             if row.correct is not None:
                 predicted = 0 if row.seed is not None else row.spp or 1
-                trials[row.step] = Evaluation.of(judgement_of(row), predicted=predicted)
+                trials[row.step] = Evaluation.from_judgement(
+                    read_judgement(row), predicted=predicted
+                )
         self._trials[kind] = trials
-        self.lost += sum(
-            trial.said.prediction.label == LOST for trial in trials.values()
+        self.n_lost += sum(
+            trial.required_judgement.prediction.label == LOST_LABEL
+            for trial in trials.values()
         )
         return trials
 
@@ -392,7 +400,7 @@ class Journal:
         if stored is None:
             return None
         row, cached = stored
-        if cached.u != digest(query.u) or row.seed != query.seed:
+        if cached.u != compute_digest(query.u) or row.seed != query.seed:
             raise InputError(
                 f"{self.run.path}: cannot resume: evaluation {query.number} of the "
                 f"{query.kind} is not the one that "
@@ -414,12 +422,15 @@ class Journal:
             success=bool(row.success),
             non_finite=cached.non_finite,
             cost=cached.cost,
-            judgement=None if row.correct is None else judgement_of(row),
+            judgement=None if row.correct is None else read_judgement(row),
             picture=image,
         )
 
-    def keep(
-        self, evaluated: Sequence[tuple[Query, Evaluation]], *, numbered: bool = False
+    def store(
+        self,
+        evaluated: Sequence[tuple[Query, Evaluation]],
+        *,
+        id_is_number: bool = False,
     ) -> list[Row]:
         """Store evaluations in one transaction, a row each.
 
@@ -427,7 +438,7 @@ class Journal:
 
         Args:
             evaluated: queries and their evaluations.
-            numbered: whether the id of a row is the number of its query, in whatever
+            id_is_number: whether the id of a row is the number of its query, in whatever
                 order they come.
 
         Returns:
@@ -436,11 +447,11 @@ class Journal:
         rows = list[Row]()
         cached = None
         for query, evaluation in evaluated:
-            self.lost += evaluation.lost
+            self.n_lost += evaluation.is_lost
             self._note_machine(evaluation.machine)
             if query.phase is None:
                 row = self._row_of_trial(query, evaluation)
-                if not numbered:
+                if not id_is_number:
                     trials = self._trials_of(query.kind)
                     trials[query.number] = replace(evaluation, picture=None)
             elif query.number < self._counts.get(query.kind, 0):
@@ -448,7 +459,7 @@ class Journal:
                 continue
             else:
                 row, cached = self._row_of_search(query, evaluation)
-            rows.append(replace(row, id=query.number + 1) if numbered else row)
+            rows.append(replace(row, id=query.number + 1) if id_is_number else row)
         if self.run is None:
             for row in rows:
                 row_id = row.id or len(self.rows) + 1
@@ -461,27 +472,27 @@ class Journal:
         """Store the description of a machine that is not like this one, once."""
         if name is None or name in self.machines:
             return
-        stats = self.traced.facts
+        stats = self.evaluator.worker_stats
         description: dict[str, str] = {}
         if stats is not None:
             description = dict(stats.machines.get(name, {}))
         self.machines[name] = description
-        self.set_note(MACHINES, self.machines)
+        self.set_note(MACHINES_NOTE, self.machines)
 
     def _row_of_trial(self, query: Query, evaluation: Evaluation) -> Row:
         """Return the row of a trial."""
         values = dict(query.values)
-        if query.drawn:
-            values |= self.problem.conditions_of(query.u, query.seed)
-        row = trial_row(
+        if query.draws_conditions:
+            values |= self.problem.describe_conditions(query.u, query.seed)
+        row = make_trial_row(
             query.kind,
             query.number,
             # A predicted image has no noise of its own.
             None if evaluation.predicted else query.seed,
             evaluation.predicted or query.spp,
-            evaluation.said,
+            evaluation.required_judgement,
             values,
-            sought=query.sought,
+            has_success=query.has_success,
         )
         return replace(
             row,
@@ -493,7 +504,7 @@ class Journal:
     def _row_of_search(self, query: Query, evaluation: Evaluation) -> tuple[Row, Told]:
         """Return the row of a search's evaluation, and what is stored with it."""
         problem = self.problem
-        is_finite = evaluation.finite
+        is_finite = evaluation.is_finite
         is_predicted = bool(evaluation.predicted)
         row = Row(
             query.kind,
@@ -505,20 +516,20 @@ class Journal:
             values=problem.describe(query.u),
             seconds=evaluation.seconds,
             phase=query.phase,
-            renders=0 if is_predicted else evaluation.cost * problem.draws,
+            renders=0 if is_predicted else evaluation.cost * problem.n_draws,
             machine=evaluation.machine,
         )
         if evaluation.judgement is not None:
-            row = judged(row, evaluation.judgement)
+            row = add_judgement(row, evaluation.judgement)
         gradient = None
         if evaluation.gradient is not None:
             gradient = evaluation.gradient.detach().numpy()
         image = None
         if evaluation.picture is not None:
-            image = levels_of(evaluation.picture).numpy()
+            image = to_uint8(evaluation.picture).numpy()
         cached = Told(
             query.number,
-            digest(query.u),
+            compute_digest(query.u),
             evaluation.non_finite,
             evaluation.cost,
             gradient,
@@ -526,7 +537,9 @@ class Journal:
         )
         return row, cached
 
-    def clock(self, kind: str, seconds: float | None) -> Callable[[int], bool] | None:
+    def make_time_check(
+        self, kind: str, seconds: float | None
+    ) -> Callable[[int], bool] | None:
         """Return a function that tells whether the time of a search is over.
 
         The time before the run was resumed counts. An evaluation that is read from the
@@ -574,7 +587,7 @@ class Journal:
 
     # ---- notes
 
-    def note(self, key: str) -> Any:
+    def get_note(self, key: str) -> Any:
         """Return the stored note of a key; None if there is none."""
         return None if self.run is None else self.run.store.noted(key)
 
@@ -584,7 +597,7 @@ class Journal:
             self.run.store.set_note(key, json.dumps(value))
 
 
-def digest(u: Tensor) -> bytes:
+def compute_digest(u: Tensor) -> bytes:
     """Return 16 bytes that identify a configuration (d,) by all its bits."""
     array = np.ascontiguousarray(u.detach().numpy())
     return hashlib.blake2b(array.tobytes(), digest_size=16).digest()

@@ -22,7 +22,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Objective, get_objective
-from advsearch.attacks.objectives import OBJECTIVE_KINDS, More, labels_of, nothing_more
+from advsearch.attacks.objectives import (
+    OBJECTIVE_KINDS,
+    ReadInput,
+    reject_inputs,
+    truth_to_labels,
+)
 from advsearch.controls import Space
 from advsearch.controls.base import Control
 from advsearch.copies import copied
@@ -39,10 +44,10 @@ from advsearch.runs.results import PrintTerms
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import Surfaces
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.things import ALL
+from advsearch.scene.things import ALL_THINGS
 from advsearch.tasks import Facts, Judgement, Task
 from advsearch.tasks.base import Output, Truth, mean
-from advsearch.tasks.together import Ensemble, Outputs, Together, of_each
+from advsearch.tasks.together import Ensemble, EnsembleTask, Outputs, split_by_model
 from advsearch.trust.code import check_import, current_directory_importable
 
 Metric = Callable[[Tensor, Any, Any], Any]
@@ -57,7 +62,7 @@ Metrics = Mapping[str, Metric]
 MAIN = "__main__"
 
 
-def metrics_as_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
+def metrics_to_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
     """Return metrics as a file names them: "package.module:function".
 
     A function that cannot be named so has its bare name.
@@ -109,7 +114,7 @@ def _import_name(function: Metric) -> str:
     return str(getattr(function, "__name__", type(function).__name__))
 
 
-def only_here(settings: Mapping[str, str]) -> list[str]:
+def list_session_only_metrics(settings: Mapping[str, str]) -> list[str]:
     """List the metrics, by name, that exist in this Python session only."""
     return [
         name
@@ -118,9 +123,9 @@ def only_here(settings: Mapping[str, str]) -> list[str]:
     ]
 
 
-def check_shared(settings: Mapping[str, str]) -> None:
+def check_metrics_importable(settings: Mapping[str, str]) -> None:
     """Raise InputError for a metric that workers could not import."""
-    for name in only_here(settings):
+    for name in list_session_only_metrics(settings):
         bare_name = settings[name].rpartition(":")[2]
         raise InputError(
             f"metrics: {name}: workers import a metric by its name, and "
@@ -131,20 +136,21 @@ def check_shared(settings: Mapping[str, str]) -> None:
 
 
 def load_metrics(
-    settings: Mapping[str, str], given: Mapping[str, str | Metric] | None = None
+    settings: Mapping[str, str],
+    python_functions: Mapping[str, str | Metric] | None = None,
 ) -> Metrics:
     """Return the functions of metrics by name.
 
     Args:
-        settings: import name of each, see `metrics_as_settings`.
-        given: functions that the caller passed; they are not imported.
+        settings: import name of each, see `metrics_to_settings`.
+        python_functions: functions that the caller passed; they are not imported.
 
     Raises:
         InputError: a function cannot be imported, or is none.
     """
     loaded: dict[str, Any] = {}
     for name, import_name in settings.items():
-        function: Any = (given or {}).get(name)
+        function: Any = (python_functions or {}).get(name)
         loaded[name] = (
             function if callable(function) else _import_metric(name, import_name)
         )
@@ -176,10 +182,10 @@ def _import_metric(name: str, import_name: str) -> Any:
     return function
 
 
-def judgements(
+def judge_images(
     task: Task,
     output: Output,
-    pictures: Tensor,
+    images: Tensor,
     truths: Sequence[Truth],
     metrics: Metrics = MappingProxyType({}),
 ) -> list[Judgement]:
@@ -190,14 +196,14 @@ def judgements(
     Args:
         task: judges the output.
         output: of the model for all N images.
-        pictures: (N, H, W, 3) sRGB in [0, 1].
+        images: (N, H, W, 3) sRGB in [0, 1].
         truths: N, or one that holds for all images.
         metrics: user functions by name.
     """
     with torch.no_grad():
         if len(truths) == 1:
             judged = task.judge(output, truths[0])
-            truths = [truths[0]] * len(pictures)
+            truths = [truths[0]] * len(images)
         else:
             judged = [
                 task.judge(output[index : index + 1], truth)[0]
@@ -206,19 +212,19 @@ def judgements(
     if not metrics:
         return judged
     return [
-        measured(
-            judged[index], metrics, pictures[index], output[index : index + 1], truth
+        add_metrics(
+            judged[index], metrics, images[index], output[index : index + 1], truth
         )
         for index, truth in enumerate(truths)
     ]
 
 
-def with_things(judgement: Judgement, things: JsonObject | None) -> Judgement:
+def add_visible_things(judgement: Judgement, things: JsonObject | None) -> Judgement:
     """Return a judgement whose payload has what the image shows of each thing.
 
     What the task states of a thing already is not replaced.
     """
-    if things is None or judgement.not_a_number:
+    if things is None or judgement.is_not_a_number:
         return judgement
     payload = judgement.payload if isinstance(judgement.payload, dict) else {}
     judged_things: Any = payload.get("things", {})
@@ -229,7 +235,7 @@ def with_things(judgement: Judgement, things: JsonObject | None) -> Judgement:
     return replace(judgement, payload={**payload, "things": all_things})
 
 
-def measured(
+def add_metrics(
     judgement: Judgement, metrics: Metrics, image: Tensor, output: Output, truth: Truth
 ) -> Judgement:
     """Return a judgement with the values of metrics.
@@ -281,7 +287,7 @@ def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
         ]
         outputs, truths = zip(*pairs, strict=True) if pairs else ((), ())
         return outputs, truths
-    labels = labels_of(truth, output, 1)
+    labels = truth_to_labels(truth, output, 1)
     first_label = labels[0] if isinstance(labels, Tensor) else labels
     return first_output, first_label
 
@@ -304,12 +310,12 @@ def mean_metrics(judgements: Sequence[Judgement]) -> dict[str, float | None] | N
     return means or None
 
 
-LOOK_SPP = 16  # samples per pixel of the clean image that calibrates a task
+CALIBRATION_SPP = 16  # samples per pixel of the clean image that calibrates a task
 
-Described = Callable[[], Mapping[str, Value]]
+DescribeConfiguration = Callable[[], Mapping[str, Value]]
 """Describes the configuration in named values, when it is called."""
 
-Looked = Callable[[], Surfaces]
+RenderSurfaces = Callable[[], Surfaces]
 """Renders what the camera sees, when it is called."""
 
 
@@ -346,8 +352,8 @@ def calibrate_task(
             model,
             task=task,
             label=label,
-            judge=OBJECT if judge == ALL else judge,
-            spp=LOOK_SPP,
+            judge=OBJECT if judge == ALL_THINGS else judge,
+            spp=CALIBRATION_SPP,
             **image_settings,
         )
         view = rendering.views[0]
@@ -378,7 +384,9 @@ def check_truth(
     except InputError as error:
         if facts.label is not None:
             raise
-        rendering = render(scene, model, task=task, spp=LOOK_SPP, **image_settings)
+        rendering = render(
+            scene, model, task=task, spp=CALIBRATION_SPP, **image_settings
+        )
         predictions = rendering.views[0].predictions
         prediction_texts = ", ".join(
             seen_text(task.name, replace(prediction, label=repr(prediction.label)))
@@ -397,7 +405,7 @@ def check_truth(
         ) from None
 
 
-def one_label_for_several(
+def find_label_warnings(
     models: Sequence[Model], label: str | None, objects: Mapping[str, str | None]
 ) -> list[str]:
     """Return a warning if a label for all objects is another class than their own.
@@ -443,7 +451,7 @@ def _has_disjoint_classes(models: Sequence[Model], first: str, second: str) -> b
 # nearest, which is zero at the same colors.
 
 
-def domain_of(
+def make_domain(
     controls: Sequence[Control], start: Tensor | None = None, **more: Any
 ) -> Domain:
     """Return the domain of a search over some controls: the budgets of their groups.
@@ -471,7 +479,7 @@ def domain_of(
     return Domain(start, tuple(blocks), **more)
 
 
-class Named(Mapping[str, Tensor]):
+class StackedTensors(Mapping[str, Tensor]):
     """Tensors of N configurations by name, stacked to (N, ...) when one is read.
 
     `what` is what a name stands for, in the message about an unknown one.
@@ -511,10 +519,12 @@ class ConfigurationInputs:
         wholes: N configurations (d,) of `space`, equal in what is searched.
     """
 
-    def __init__(self, space: Space, searched: Space, wholes: Sequence[Tensor]) -> None:
+    def __init__(
+        self, space: Space, searched: Space, full_configurations: Sequence[Tensor]
+    ) -> None:
         self._space = space
         self._searched = searched
-        self._configurations = wholes
+        self._configurations = full_configurations
         self.used = False
 
     def __call__(self, name: str) -> Any:
@@ -534,17 +544,17 @@ class ConfigurationInputs:
         self.used = True
         if name == "inputs":
             inputs = [self._space.inputs(u) for u in self._configurations]
-            return Named("input of the scene", inputs)
+            return StackedTensors("input of the scene", inputs)
         if name == "configuration":
-            values = [self._space.numbers(u) for u in self._configurations]
-            return Named("number of the configuration", values)
+            values = [self._space.get_numeric_values(u) for u in self._configurations]
+            return StackedTensors("number of the configuration", values)
         n_configurations = len(self._configurations)
         searched_u = self._configurations[0][: len(self._searched.start)]
         if name == "u":
             return searched_u.expand(n_configurations, *searched_u.shape)
-        textures = self._searched.printed(searched_u)
+        textures = self._searched.get_printable_colors(searched_u)
         if name == "textures":
-            return Named(
+            return StackedTensors(
                 "control whose colours are searched:", [textures] * n_configurations
             )
         if len(textures) != 1:
@@ -566,20 +576,20 @@ class ConfigurationInputs:
         )
 
 
-LOW = 0.1
-HIGH = 0.9
-STEP = 0.2
+MIN_PRINTABLE = 0.1
+MAX_PRINTABLE = 0.9
+PRINTABLE_STEP = 0.2
 """The printable colors: all 125 whose channels are 0.1, 0.3, 0.5, 0.7 or 0.9 in sRGB.
 
 No printer was measured: the colors only express that ink on paper reaches neither the
 black, nor the white, nor the pure colors of a screen.
 """
 # of each print term, in units of the objective (logits for a margin) per unit of sRGB
-WEIGHT = 10.0
-LEAST = 2.0**-40  # shortest step in sRGB that has a gradient
+PRINT_WEIGHT = 10.0
+MIN_COLOR_STEP = 2.0**-40  # shortest step in sRGB that has a gradient
 
 
-def variation(colors: Tensor) -> Tensor:
+def mean_variation(colors: Tensor) -> Tensor:
     """Return the mean length of the step from a pixel to its right and lower neighbors.
 
     Args:
@@ -597,13 +607,13 @@ def variation(colors: Tensor) -> Tensor:
     squared_right = F.pad(right.square(), (0, 0, 0, 1))
     squared_down = F.pad(down.square(), (0, 0, 0, 0, 0, 1))
     squared = squared_right + squared_down
-    length = squared.clamp(min=LEAST**2).sqrt() - LEAST
+    length = squared.clamp(min=MIN_COLOR_STEP**2).sqrt() - MIN_COLOR_STEP
     if is_masked:
         length = length[mask[..., 0] > 0.0]
     return length.mean()
 
 
-def off_print(colors: Tensor, palette: Tensor | None = None) -> Tensor:
+def printable_distance(colors: Tensor, palette: Tensor | None = None) -> Tensor:
     """Return the mean Euclidean distance of pixels from the nearest printable color.
 
     Args:
@@ -615,7 +625,10 @@ def off_print(colors: Tensor, palette: Tensor | None = None) -> Tensor:
         colors = colors[colors[..., 3] > 0][:, None, :3]
     fixed_colors = colors.detach()
     if palette is None:
-        nearest = (LOW + STEP * ((fixed_colors - LOW) / STEP).round()).clamp(LOW, HIGH)
+        nearest = (
+            MIN_PRINTABLE
+            + PRINTABLE_STEP * ((fixed_colors - MIN_PRINTABLE) / PRINTABLE_STEP).round()
+        ).clamp(MIN_PRINTABLE, MAX_PRINTABLE)
     else:
         palette = palette.to(colors)
         palette_index = torch.cdist(fixed_colors.reshape(-1, 3), palette).argmin(dim=1)
@@ -630,68 +643,72 @@ def _compute_print_terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
     Raises:
         InputError: no control has searched colors.
     """
-    textures = list(space.printed(u).values())
+    textures = list(space.get_printable_colors(u).values())
     if not textures:
         control_names = ", ".join(control.name for control in space.controls)
         raise InputError(
             "printable: expected a search over the colours of a texture or a patch, "
             f"got {control_names}; add `texture` or `patch`, or leave it out"
         )
-    variations = [variation(texture) for texture in textures]
-    distances = [off_print(texture) for texture in textures]
+    variations = [mean_variation(texture) for texture in textures]
+    distances = [printable_distance(texture) for texture in textures]
     return torch.stack(variations).sum(), torch.stack(distances).sum()
 
 
-def print_terms(space: Space, u: Tensor) -> PrintTerms:
+def measure_print_terms(space: Space, u: Tensor) -> PrintTerms:
     """Measure how printable the searched colors of a configuration (d,) are."""
     with torch.no_grad():
         total_variation, total_distance = _compute_print_terms(space, u)
     return PrintTerms(variation=float(total_variation), off_print=float(total_distance))
 
 
-def penalised(found: Evaluation, space: Space, u: Tensor) -> Evaluation:
+def subtract_print_penalty(
+    evaluation: Evaluation, space: Space, u: Tensor
+) -> Evaluation:
     """Return an evaluation of u (d,) minus both weighted print terms.
 
     They are subtracted from its objective, and their derivative from its gradient.
     """
     variable_u = u.detach().clone().requires_grad_()
     with torch.enable_grad():
-        penalty = WEIGHT * torch.stack(_compute_print_terms(space, variable_u)).sum()
+        penalty = (
+            PRINT_WEIGHT * torch.stack(_compute_print_terms(space, variable_u)).sum()
+        )
         (penalty_gradient,) = torch.autograd.grad(penalty, variable_u)
     gradient = None
-    if found.gradient is not None:
-        gradient = found.gradient - penalty_gradient
-    objective = found.objective - float(penalty.detach())
-    return replace(found, objective=objective, gradient=gradient)
+    if evaluation.gradient is not None:
+        gradient = evaluation.gradient - penalty_gradient
+    objective = evaluation.objective - float(penalty.detach())
+    return replace(evaluation, objective=objective, gradient=gradient)
 
 
 AnyObjective = str | Callable[..., Tensor]
 
-Way = Literal["mean", "worst"]
+EnsembleReduction = Literal["mean", "worst"]
 
 # samples per pixel of the clean image that an objective compares features with
 CLEAN_SPP = 64
 
 
-def task_for(task: Task, model: Model) -> Task:
+def make_ensemble_task(task: Task, model: Model) -> Task:
     """Return the task of a model; for an ensemble, the joint task of its models."""
-    if isinstance(task, Together) or not isinstance(model.module, Ensemble):
+    if isinstance(task, EnsembleTask) or not isinstance(model.module, Ensemble):
         return task
-    return Together(parts=(task,) * len(model.module.models))
+    return EnsembleTask(parts=(task,) * len(model.module.models))
 
 
-def objective_for(
-    wanted: AnyObjective,
+def make_objective(
+    requested: AnyObjective,
     task: Task,
     model: Model,
     renderer: Renderer,
     seed: int,
-    ensemble: Way | None = None,
+    ensemble: EnsembleReduction | None = None,
 ) -> tuple[Objective, str]:
     """Return the function that a search maximises, and a remark about it or "".
 
     Args:
-        wanted: name of an objective, or a function.
+        requested: name of an objective, or a function.
         task: of the model.
         model: whose output is maximised.
         renderer: renders the clean image for an objective that compares features.
@@ -702,23 +719,25 @@ def objective_for(
     Raises:
         InputError: an objective of features, and several models.
     """
-    kind = OBJECTIVE_KINDS.get(wanted) if isinstance(wanted, str) else None
+    kind = OBJECTIVE_KINDS.get(requested) if isinstance(requested, str) else None
     needs_features = kind is not None and kind.needs_features
-    if isinstance(task, Together):
+    if isinstance(task, EnsembleTask):
         if needs_features:
             raise InputError(
-                f"objective: {wanted} compares the features of one model; "
+                f"objective: {requested} compares the features of one model; "
                 "take another for `ensemble`"
             )
-        uses_task_objectives = wanted == Together.objective
+        uses_task_objectives = requested == EnsembleTask.objective
         objectives = [
-            get_objective(part.objective if uses_task_objectives else wanted, part)
+            get_objective(part.objective if uses_task_objectives else requested, part)
             for part in task.tasks
         ]
-        default_ensemble: Way = "worst" if uses_task_objectives else "mean"
-        return of_ensemble(objectives, ensemble or default_ensemble), ""
+        default_ensemble: EnsembleReduction = (
+            "worst" if uses_task_objectives else "mean"
+        )
+        return reduce_objectives(objectives, ensemble or default_ensemble), ""
     if not needs_features:
-        return get_objective(wanted, task), ""
+        return get_objective(requested, task), ""
     # Without logits, the output of the model itself is compared.
     features = features_of(model) if task.reads_logits else None
     with torch.no_grad():
@@ -727,12 +746,14 @@ def objective_for(
     if features is not None and not features.penultimate:
         remark = features.source
     objective = get_objective(
-        wanted, task, features=features or model, clean=clean_image
+        requested, task, features=features or model, clean=clean_image
     )
     return objective, remark
 
 
-def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:
+def reduce_objectives(
+    objectives: Sequence[Objective], reduction: EnsembleReduction
+) -> Objective:
     """Return the objective of several models: the mean of theirs, or the smallest.
 
     With "worst" the model that is hardest to mislead is the one that counts, so that
@@ -744,16 +765,16 @@ def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:
         output: Sequence[Outputs],
         images: Tensor,
         truth: tuple[Any, ...],
-        more: More = nothing_more,
+        more: ReadInput = reject_inputs,
         /,
     ) -> Tensor:
         values = [
             objective_of_model(output_of_model, images, truth_of_model, more)
             for objective_of_model, output_of_model, truth_of_model in zip(
-                objectives, of_each(output), truth, strict=True
+                objectives, split_by_model(output), truth, strict=True
             )
         ]
         stacked = torch.stack(values)
-        return stacked.mean(dim=0) if way == "mean" else stacked.amin(dim=0)
+        return stacked.mean(dim=0) if reduction == "mean" else stacked.amin(dim=0)
 
     return objective

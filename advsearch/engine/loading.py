@@ -13,49 +13,49 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.calls import helped
+from advsearch.calls import with_checked_arguments
 from advsearch.controls import (
     CONTROLS,
     Control,
     Space,
-    gathered,
+    check_control_settings,
     make_control,
     make_space,
-    settings_by_name,
+    merge_control_settings,
 )
-from advsearch.distributions import OwnQuantiles, as_setting
+from advsearch.distributions import PythonQuantiles, distribution_to_setting
 from advsearch.errors import InputError
-from advsearch.options import things_as_text, told
+from advsearch.options import describe_value, format_things
 from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
-from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
-from advsearch.scene.camera_model import bundled, pinhole
+from advsearch.scene.assets import EnvironmentAsset, Float32Array, ObjectAsset
+from advsearch.scene.camera_model import make_bundled_models, make_pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
-    NO_MAP,
+    NO_ENVIRONMENT,
     SceneDescription,
     check_ground,
-    check_meshes,
-    check_one_environment,
-    describe,
+    check_mesh_names,
+    check_single_environment,
+    load_description,
 )
 from advsearch.scene.formation import (
-    A_PIXEL,
-    EVERYTHING,
-    FEWEST,
-    MOST,
+    ALL_OMISSIONS,
+    MAX_MOMENTS,
+    MIN_MOMENTS,
+    MOMENTS_PER_PIXEL,
     SAMPLER,
     ImageFormation,
     Moment,
-    moments_of,
+    divide_exposure,
 )
-from advsearch.scene.grounds import on_its_ground
-from advsearch.scene.headlamps import with_lamps
-from advsearch.scene.importing.pictures import read_picture
+from advsearch.scene.grounds import with_requested_ground
+from advsearch.scene.headlamps import add_lamps
+from advsearch.scene.importing.pictures import read_image
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.settings import ORBIT_CAMERA, Given
-from advsearch.settings import as_python, read_controls
+from advsearch.scene.settings import ORBIT_CAMERA, SettingValues
+from advsearch.settings import parse_controls, to_python
 from advsearch.trust.code import names_code
 from advsearch.trust.foreign_code import plainly
 
@@ -81,11 +81,11 @@ class Scene:
 
     Attributes:
         description: the scene as data.
-        only_here: whether it holds Python objects that no file and no command can name.
+        is_session_only: whether it holds Python objects that no file and no command can name.
     """
 
     description: SceneDescription
-    only_here: bool = False
+    is_session_only: bool = False
 
     @names_code
     def renderer(
@@ -114,10 +114,10 @@ class Scene:
             InputError: a control is unknown or impossible in this scene, or an argument
                 is out of range.
         """
-        resolution = as_python(resolution)
-        description = framed(self.description, resolution)
+        resolution = to_python(resolution)
+        description = fit_camera(self.description, resolution)
         with plainly():
-            space = make_space(as_controls(controls), description)
+            space = make_space(make_controls(controls), description)
             return make_renderer(
                 description,
                 space,
@@ -128,7 +128,7 @@ class Scene:
                 sampler=sampler,
             )
 
-    def lit_by(self, environment: EnvironmentAsset | None) -> Scene:
+    def with_environment(self, environment: EnvironmentAsset | None) -> Scene:
         """Return the scene under another environment; None for no environment map.
 
         The environment counts as chosen by the user.
@@ -137,18 +137,18 @@ class Scene:
             InputError: the ground of the scene shows the photograph of its environment,
                 and the new one has none.
         """
-        name = NO_MAP if environment is None else environment.name
+        name = NO_ENVIRONMENT if environment is None else environment.name
         description = self.description
-        check_ground(description.given_values, name)
+        check_ground(description.requested_values, name)
         if environment is not None:
-            check_one_environment(description.parts, f"`environment={name}`")
+            check_single_environment(description.parts, f"`environment={name}`")
         relit = replace(
             description,
             environment=environment,
             environment_spec=name,
-            given=description.given | {ENVIRONMENT},
+            requested=description.requested | {ENVIRONMENT},
         )
-        return Scene(with_lamps(on_its_ground(relit)), self.only_here)
+        return Scene(add_lamps(with_requested_ground(relit)), self.is_session_only)
 
     def __getattr__(self, name: str) -> Any:
         if name == "render":
@@ -164,7 +164,7 @@ class Scene:
         description = self.description
         fixed = "".join(
             f", {name}={value!r}"
-            for name, value in sorted(description.given_values.items())
+            for name, value in sorted(description.requested_values.items())
         )
         names = f"{description.object_name!r}, {description.environment_name!r}"
         return f"Scene({names}{fixed})"
@@ -177,33 +177,37 @@ class Scene:
             InputError: the array is no (h, w, 3) picture in [0, 1].
         """
         if isinstance(texture, (str, Path)):
-            texels = read_picture(Path(texture), None)
+            texels = read_image(Path(texture), None)
         else:
             texels = _array_to_texels(texture)
         retextured = replace(self.description.object, base_color=texels)
-        return Scene(replace(self.description, object=retextured), only_here=True)
+        return Scene(replace(self.description, object=retextured), is_session_only=True)
 
-    def with_settings(self, given: Given) -> Scene:
+    def with_settings(self, overrides: SettingValues) -> Scene:
         """Return the scene with some of its parameters fixed to other values.
 
         Raises:
             InputError: a name is unknown or a value out of range.
         """
-        resolved = settings.resolve(given)
+        resolved = settings.resolve_settings(overrides)
         description = self.description
-        check_meshes(description, given)
+        check_mesh_names(description, overrides)
         if description.camera_model is not None:
-            description.camera_model.check_given(given)
-        values = {**description.values, **{name: resolved[name] for name in given}}
-        if "camera.elevation" in given:
+            description.camera_model.check_no_fov(overrides)
+        values = {**description.values, **{name: resolved[name] for name in overrides}}
+        if "camera.elevation" in overrides:
             values["camera.height"] = None
-        changed = on_its_ground(
-            replace(description, values=values, given=description.given | set(given))
+        changed = with_requested_ground(
+            replace(
+                description,
+                values=values,
+                requested=description.requested | set(overrides),
+            )
         )
-        return Scene(with_lamps(changed), self.only_here)
+        return Scene(add_lamps(changed), self.is_session_only)
 
 
-@helped
+@with_checked_arguments
 @plainly()
 def load_scene(
     object: str | Path | ObjectAsset,
@@ -214,7 +218,7 @@ def load_scene(
     facing: str | None = None,
     size: float | None = None,
     unit: str | None = None,
-    settings: Given | None = None,
+    settings: SettingValues | None = None,
     camera: str | None = None,
     texture: Texture | None = None,
     things: str
@@ -269,8 +273,8 @@ def load_scene(
     object_spec = object
     if scene is not None and mitsuba_dict is None:
         object_spec = f"{scene}#{object}"
-    fixed_values = None if settings is None else as_python(settings)
-    description = describe(
+    fixed_values = None if settings is None else to_python(settings)
+    description = load_description(
         object_spec,
         environment,
         up=up,
@@ -279,19 +283,19 @@ def load_scene(
         given=fixed_values,
         unit=unit,
         plugins=mitsuba_dict,
-        things=things_as_text(things),
+        things=format_things(things),
     )
     if camera is not None:
-        description = description.seen_by(camera)
+        description = description.with_camera(camera)
     has_asset = any(
         asset is not None and not isinstance(asset, (str, Path))
         for asset in (object, environment)
     )
-    loaded = Scene(description, only_here=mitsuba_dict is not None or has_asset)
+    loaded = Scene(description, is_session_only=mitsuba_dict is not None or has_asset)
     return loaded if texture is None else loaded.with_texture(texture)
 
 
-def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Floats:
+def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
     """Return a texture (h, w, 3) as contiguous float32 sRGB in [0, 1].
 
     Values of dtype uint8 are divided by 255.
@@ -303,7 +307,7 @@ def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Floats:
         texture.detach().cpu() if isinstance(texture, Tensor) else texture
     )
     scale = 255.0 if array.dtype == np.uint8 else 1.0
-    texels: Floats = array.astype(np.float32) / scale
+    texels: Float32Array = array.astype(np.float32) / scale
     if texels.ndim != 3 or texels.shape[2] != 3 or not texels.size:
         raise InputError(
             f"texture: expected a picture (h, w, 3), got an array of shape {array.shape}"
@@ -317,10 +321,10 @@ def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Floats:
     return np.ascontiguousarray(texels)
 
 
-def scene_as_settings(scene: Scene) -> dict[str, Any]:
+def scene_to_settings(scene: Scene) -> dict[str, Any]:
     """Return the settings by which a configuration names a loaded scene.
 
-    The keys are those of `SceneConfig`; a scene with `only_here` has parts that these
+    The keys are those of `SceneConfig`; a scene with `list_session_only_controls` has parts that these
     settings cannot name.
     """
     description = scene.description
@@ -333,7 +337,7 @@ def scene_as_settings(scene: Scene) -> dict[str, Any]:
         "unit": description.unit,
         "camera": _camera_setting(description),
         "things": description.things_spec or None,
-        "set": description.given_values,
+        "set": description.requested_values,
     }
 
 
@@ -349,7 +353,7 @@ def _camera_setting(description: SceneDescription) -> str | None:
     return None if description.camera == ORBIT_CAMERA else description.camera
 
 
-def framed(
+def fit_camera(
     description: SceneDescription, resolution: int | tuple[int, int]
 ) -> SceneDescription:
     """Return the scene with its camera fitted to a picture size.
@@ -372,10 +376,10 @@ def framed(
             )
         # Drops need a camera whose rays are computed one by one.
         if camera_model is None or not camera_model.name:
-            camera_model = pinhole(description.number("camera.fov"), aspect)
+            camera_model = make_pinhole(description.number("camera.fov"), aspect)
     if camera_model is not None:
-        camera_model = bundled(aspect).get(camera_model.name, camera_model)
-        scaling_remarks = camera_model.scaling((height, width))
+        camera_model = make_bundled_models(aspect).get(camera_model.name, camera_model)
+        scaling_remarks = camera_model.describe_scaling((height, width))
         remarks = tuple(dict.fromkeys((*remarks, *scaling_remarks)))
     return replace(
         description, aspect=aspect, camera_model=camera_model, remarks=remarks
@@ -396,7 +400,7 @@ def make_renderer(
     denoise: str,
     seed: int,
     estimators: Mapping[str, str] | None = None,
-    leave_out: Collection[str] = EVERYTHING,
+    leave_out: Collection[str] = ALL_OMISSIONS,
     sampler: str = SAMPLER,
     *,
     differentiated: bool = True,
@@ -413,7 +417,7 @@ def make_renderer(
     """
     size = _height_and_width(resolution)
     description = space.scene or description
-    if not description.lit:
+    if not description.is_lit:
         raise InputError(
             "environment: the scene has neither a map nor a lamp, so that every "
             "picture is black; give it one of the two, such as `controls=light`"
@@ -435,7 +439,7 @@ def make_renderer(
         motion = Motion(description, size, scene.assembly)
     moments: tuple[Moment, ...] = ()
     if has_exposure_time and motion is not None:
-        moments = exposed_in(space, motion, scene.assembly, size[0])
+        moments = choose_moments(space, motion, scene.assembly, size[0])
     return Renderer(
         scene,
         space,
@@ -453,7 +457,7 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
     Raises:
         InputError: nothing changes with time, or a picture has motion blur.
     """
-    if not any(mount.later for mount in description.rig):
+    if not any(mount.delay for mount in description.rig):
         return
     in_order = (
         f"camera: the pictures of {description.rig_spec} are taken one after the other"
@@ -463,7 +467,7 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
             f"{in_order}, and can not have motion blur or a rolling shutter; "
             "leave that out"
         )
-    controls_later = space.later(1.0).controls
+    controls_later = space.advance_time(1.0).controls
     changes_with_time = any(
         control is not control_later
         for control, control_later in zip(space.controls, controls_later, strict=True)
@@ -474,11 +478,13 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
         )
 
 
-A_FLASH = 8  # moments of each flash of a light
-LOOKS = 64  # random configurations on which motion during an exposure is measured
+MOMENTS_PER_FLASH = 8  # moments of each flash of a light
+N_MOTION_SAMPLES = (
+    64  # random configurations on which motion during an exposure is measured
+)
 
 
-def exposed_in(
+def choose_moments(
     space: Space, motion: Motion, assembly: Assembly, height: int
 ) -> tuple[Moment, ...]:
     """Return the moments of an exposure at which a picture is rendered.
@@ -490,12 +496,12 @@ def exposed_in(
     duration = shutter + abs(rolling)
     max_pixels_moved = _measure_max_motion(space, motion, assembly, duration)
     n_flashes = max(control.flashes for control in space.controls) * duration
-    n_for_motion = math.ceil(A_PIXEL * max_pixels_moved)
-    n_for_flashes = math.ceil(A_FLASH * n_flashes)
-    n_moments = min(max(FEWEST, n_for_motion, n_for_flashes), MOST)
-    offsets, rows, samples = moments_of(shutter, rolling, height, n_moments)
+    n_for_motion = math.ceil(MOMENTS_PER_PIXEL * max_pixels_moved)
+    n_for_flashes = math.ceil(MOMENTS_PER_FLASH * n_flashes)
+    n_moments = min(max(MIN_MOMENTS, n_for_motion, n_for_flashes), MAX_MOMENTS)
+    offsets, rows, samples = divide_exposure(shutter, rolling, height, n_moments)
     return tuple(
-        Moment(space.later(float(offset)), rows_of_moment, samples)
+        Moment(space.advance_time(float(offset)), rows_of_moment, samples)
         for offset, rows_of_moment in zip(offsets, rows, strict=True)
     )
 
@@ -505,22 +511,28 @@ def _measure_max_motion(
 ) -> float:
     """Return how many pixels a point moves at most in a duration in seconds.
 
-    It is measured on `LOOKS` random configurations of the controls that move, on points
+    It is measured on `N_MOTION_SAMPLES` random configurations of the controls that move, on points
     that are visible before and after.
     """
     moving_controls = tuple(
         control for control in space.controls if any(control.exposure)
     )
     moving_space = replace(space, controls=moving_controls)
-    space_at_begin = moving_space.later(-duration / 2.0)
-    space_at_end = moving_space.later(duration / 2.0)
+    space_at_begin = moving_space.advance_time(-duration / 2.0)
+    space_at_end = moving_space.advance_time(duration / 2.0)
     configurations = torch.rand(
-        LOOKS, len(moving_space.start), generator=torch.Generator().manual_seed(0)
+        N_MOTION_SAMPLES,
+        len(moving_space.start),
+        generator=torch.Generator().manual_seed(0),
     )
     max_moved = 0.0
     for u in configurations:
-        before, is_visible_before = motion.pixels(assembly(space_at_begin.inputs(u)))
-        after, is_visible_after = motion.pixels(assembly(space_at_end.inputs(u)))
+        before, is_visible_before = motion.project_points(
+            assembly(space_at_begin.inputs(u))
+        )
+        after, is_visible_after = motion.project_points(
+            assembly(space_at_end.inputs(u))
+        )
         is_visible = is_visible_before & is_visible_after
         moved = (after - before)[is_visible].norm(dim=1)
         if len(moved):
@@ -528,28 +540,28 @@ def _measure_max_motion(
     return max_moved
 
 
-def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
+def controls_to_settings(controls: Controls) -> dict[str, dict[str, object]]:
     """Return settings by name, as a file holds them, for controls in any form.
 
     A control that is named has the settings that the caller stated; an instance has all
     of its settings.
     """
-    control_by_name = controls_by_name(controls)
+    control_by_name = normalize_controls(controls)
     if not isinstance(controls, Mapping):
-        as_controls(control_by_name)
+        make_controls(control_by_name)
     return {
-        name: control.settings() if isinstance(control, Control) else dict(control)
+        name: control.to_settings() if isinstance(control, Control) else dict(control)
         for name, control in control_by_name.items()
     }
 
 
-def as_controls(controls: Controls) -> tuple[Control, ...]:
+def make_controls(controls: Controls) -> tuple[Control, ...]:
     """Return control instances for controls in any form, in the caller's order.
 
     Raises:
         InputError: a control is unknown, has wrong settings, or comes twice.
     """
-    control_by_name = controls_by_name(controls)
+    control_by_name = normalize_controls(controls)
     instances: dict[str, Control] = {}
     named_settings: dict[str, Mapping[str, object]] = {}
     for name, control in control_by_name.items():
@@ -558,7 +570,7 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
             named_settings[name] = {}
         else:
             named_settings[name] = control
-    settings_by_control = gathered(named_settings)
+    settings_by_control = merge_control_settings(named_settings)
     for name in instances:
         if settings_by_control[name]:
             raise InputError(
@@ -571,7 +583,7 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
     )
 
 
-def controls_by_name(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
+def normalize_controls(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
     """Return instances and settings by name, in the caller's order.
 
     Raises:
@@ -587,7 +599,9 @@ def controls_by_name(controls: Controls) -> dict[str, Control | Mapping[str, obj
         for name, control in control_by_name.items()
         if isinstance(control, Control)
     }
-    all_settings = settings_by_name({**control_by_name, **dict.fromkeys(instances)})
+    all_settings = check_control_settings(
+        {**control_by_name, **dict.fromkeys(instances)}
+    )
     return {
         name: instances.get(name, control_settings)
         for name, control_settings in all_settings.items()
@@ -604,7 +618,7 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
     for name, control in controls.items():
         is_misnamed = isinstance(control, Control) and control.name != name
         if isinstance(control, type) or is_misnamed:
-            got = told(control)
+            got = describe_value(control)
             if isinstance(control, Control):
                 got = f"one that is called {control.name}"
             raise InputError(
@@ -615,10 +629,10 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
             control_by_name[name] = control
         elif isinstance(control, Mapping) and not control.keys() & SINGLE_VALUE_KEYS:
             control_by_name[name] = {
-                key: as_setting(value) for key, value in control.items()
+                key: distribution_to_setting(value) for key, value in control.items()
             }
         else:
-            control_by_name[name] = as_setting(control)
+            control_by_name[name] = distribution_to_setting(control)
     return control_by_name
 
 
@@ -636,12 +650,12 @@ def _read_control_list(
     control_by_name: dict[str, object] = {}
     for control in control_list:
         if isinstance(control, str):
-            added: dict[str, Any] = dict(read_controls([control], "controls"))
+            added: dict[str, Any] = dict(parse_controls([control], "controls"))
         elif isinstance(control, Control):
             added = {control.name: control}
         else:
             raise InputError(
-                f"controls: expected names or Control instances, got {told(control)}"
+                f"controls: expected names or Control instances, got {describe_value(control)}"
             )
         for name in added:
             if name in control_by_name:
@@ -653,7 +667,7 @@ def _read_control_list(
     return control_by_name
 
 
-def instances_in(controls: object) -> list[Control]:
+def list_control_instances(controls: object) -> list[Control]:
     """Return the control instances among controls in any form."""
     items = controls.values() if isinstance(controls, Mapping) else controls
     if not isinstance(items, (list, tuple, ValuesView)):
@@ -661,7 +675,7 @@ def instances_in(controls: object) -> list[Control]:
     return [control for control in items if isinstance(control, Control)]
 
 
-def only_here(controls: Controls) -> list[str]:
+def list_session_only_controls(controls: Controls) -> list[str]:
     """List the controls and parameters that exist in this Python session only.
 
     These are classes of controls without a name by which a file or another process
@@ -669,12 +683,12 @@ def only_here(controls: Controls) -> list[str]:
     """
     session_only = [
         type(control).__name__
-        for control in instances_in(controls)
+        for control in list_control_instances(controls)
         if CONTROLS.get(control.kind) is not type(control)
     ]
-    for name, control_settings in settings_of(controls).items():
+    for name, control_settings in controls_to_settings(controls).items():
         for parameter, value in control_settings.items():
-            if isinstance(value, OwnQuantiles):
+            if isinstance(value, PythonQuantiles):
                 full_name = name if "." in name else f"{name}.{parameter}"
                 session_only.append(f"{full_name} (drawn by {value['name']})")
     return session_only

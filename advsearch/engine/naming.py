@@ -18,23 +18,29 @@ from torch import nn
 
 from advsearch import threads
 from advsearch.config import SceneConfig
-from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
+from advsearch.controls import (
+    CONTROLS,
+    Choice,
+    Control,
+    merge_control_settings,
+    parse_control_name,
+)
 from advsearch.engine.loading import (
     Controls,
     Scene,
-    as_controls,
-    controls_by_name,
     load_scene,
+    make_controls,
+    normalize_controls,
 )
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.loading import named_code
+from advsearch.models.loading import parse_code_reference
 from advsearch.scene.rig import read_rig
-from advsearch.scene.settings import Given, Parameter
+from advsearch.scene.settings import Parameter, SettingValues
 from advsearch.settings import split_names
 from advsearch.tasks import Task
-from advsearch.tasks.together import Together, together
+from advsearch.tasks.together import EnsembleTask, join_models
 from advsearch.trust.foreign_code import plainly
 
 CONTROL = "control"
@@ -43,7 +49,7 @@ SCENE = "scene"
 """Roles of objects that a Python caller may pass in place of a name."""
 
 
-def scene_of(
+def load_configured_scene(
     config: SceneConfig, name: str | None = None, environment: str | None = None
 ) -> Scene:
     """Load the scene of a configuration: its only object, or a named one.
@@ -56,19 +62,19 @@ def scene_of(
             return scene
         name = config.object
         environment = config.environment
-    return load_scene(name, environment, **told_of_scene(config))
+    return load_scene(name, environment, **make_scene_kwargs(config))
 
 
-def told_of_scene(config: SceneConfig) -> dict[str, Any]:
+def make_scene_kwargs(config: SceneConfig) -> dict[str, Any]:
     """Return the keyword arguments of `load_scene` that a configuration states."""
     names = ("up", "facing", "size", "unit", "camera", "things")
     return {
         **{name: getattr(config, name) for name in names},
-        "settings": scene_settings(config),
+        "settings": collect_scene_parameters(config),
     }
 
 
-def scene_settings(config: SceneConfig) -> Given:
+def collect_scene_parameters(config: SceneConfig) -> SettingValues:
     """Return the parameters that a scene is loaded with: `set` and `exposure`.
 
     Raises:
@@ -85,11 +91,11 @@ def scene_settings(config: SceneConfig) -> Given:
     return parameters
 
 
-def code_of(
+def list_imported_code(
     models: Iterable[str], kinds: Iterable[str], metrics: Iterable[str] = ()
 ) -> tuple[str, ...]:
     """List the Python code, "package.module:attribute", that these names import."""
-    code = [*(named_code(name) for name in models), *metrics]
+    code = [*(parse_code_reference(name) for name in models), *metrics]
     code += [name for name in kinds if CONTROLS.names_class(name)]
     return tuple(dict.fromkeys(name for name in code if name))
 
@@ -103,7 +109,7 @@ def load_models(
 
     Args:
         models: names, or models that a Python caller passed.
-        task: of the models. Several tasks (`Together`) are for one model each, and
+        task: of the models. Several tasks (`EnsembleTask`) are for one model each, and
             these models are joined into one.
         config: has their labels, prompt, range of values and camera.
 
@@ -115,9 +121,9 @@ def load_models(
             or a model that takes another number of images than there are cameras.
     """
     threads.configure(config.used_threads)
-    if isinstance(task, Together):
+    if isinstance(task, EnsembleTask):
         tasks = task.parts
-        models = several(models)
+        models = list_models(models)
     else:
         tasks = (task,) * len(models)
     if len(models) != len(tasks):
@@ -140,8 +146,8 @@ def load_models(
             loaded = tuple(replace(model, cameras=n_cameras) for model in loaded)
     for model in loaded:
         _check_n_images(model)
-    if isinstance(task, Together):
-        return (together(loaded, config.resolution),), sentences
+    if isinstance(task, EnsembleTask):
+        return (join_models(loaded, config.resolution),), sentences
     return loaded, sentences
 
 
@@ -153,11 +159,11 @@ def _load_for_task(
     One of several tasks gets the labels of the configuration only where it takes labels
     and has no names of its own.
     """
-    single_image_task = task.of_one_image
+    single_image_task = task.single_image_task
     labels = None
     prompt = None
     if is_only_task or (
-        single_image_task.labelled and not single_image_task.names_from
+        single_image_task.labelled and not single_image_task.names_source
     ):
         labels = config.labels
         prompt = config.prompt
@@ -211,7 +217,7 @@ def _check_n_images(model: Model) -> None:
 AnyModel = Model | nn.Module | str | Path
 
 
-def several(models: AnyModel | Sequence[AnyModel]) -> list[AnyModel]:
+def list_models(models: AnyModel | Sequence[AnyModel]) -> list[AnyModel]:
     """Return one model or several as a list.
 
     One string may have several names, with commas between them.
@@ -228,26 +234,26 @@ def several(models: AnyModel | Sequence[AnyModel]) -> list[AnyModel]:
     return model_list
 
 
-def model_name(model: AnyModel) -> str:
+def get_model_name(model: AnyModel) -> str:
     """Return the name by which a run knows a model, which may not be loaded yet."""
     if isinstance(model, (str, Path)):
         return str(model)
-    if isinstance(model, Model) and model.asked:
-        return model.asked
+    if isinstance(model, Model) and model.spec:
+        return model.spec
     return str(getattr(model, "name", None) or type(model).__name__)
 
 
-def exists_here(model: AnyModel) -> bool:
+def is_session_only(model: AnyModel) -> bool:
     """Return whether a model exists in this session only.
 
     Then no file and no command can name it.
     """
     if isinstance(model, Model):
-        return model.asked is None
+        return model.spec is None
     return not isinstance(model, (str, Path))
 
 
-def different(names: Sequence[str], setting: str) -> Sequence[str]:
+def check_distinct(names: Sequence[str], setting: str) -> Sequence[str]:
     """Return the names.
 
     Raises:
@@ -262,7 +268,7 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
     return names
 
 
-OF_SCENE = (
+SCENE_SETTINGS = (
     "set",
     "environment",
     "up",
@@ -276,9 +282,9 @@ OF_SCENE = (
 )
 
 
-def check_not_of_scene(settings: Mapping[str, object]) -> None:
+def check_no_scene_settings(settings: Mapping[str, object]) -> None:
     """Raise InputError for settings of a scene that is loaded already."""
-    rejected = [name for name in OF_SCENE if settings.get(name) is not None]
+    rejected = [name for name in SCENE_SETTINGS if settings.get(name) is not None]
     if rejected:
         raise InputError(
             f"{', '.join(rejected)}: belongs to the scene, and a loaded "
@@ -286,7 +292,7 @@ def check_not_of_scene(settings: Mapping[str, object]) -> None:
         )
 
 
-def check_not_spread(settings: Mapping[str, object]) -> None:
+def check_no_worker_settings(settings: Mapping[str, object]) -> None:
     """Raise InputError for settings of workers, where the run has loaded objects."""
     for name in ("workers", "cluster"):
         if settings.get(name) is not None:
@@ -305,7 +311,7 @@ without such a setting counts as one that does not state it.
 """
 
 
-def given_to(
+def make_configured_controls(
     config: SceneConfig, controls: Controls, *, are_searched: bool = True
 ) -> tuple[Control, ...]:
     """Return control instances with the run's settings where they state none.
@@ -319,12 +325,12 @@ def given_to(
     if not are_searched:
         config = config.model_copy(update={"epsilon": None})
     control_by_name: dict[str, Any] = {}
-    for name, control in controls_by_name(controls).items():
+    for name, control in normalize_controls(controls).items():
         if not isinstance(control, Control):
             control = config.python_object(CONTROL, name) or control
         control_by_name[name] = control
     # Unknown controls are rejected here, before settings are read.
-    as_controls(control_by_name)
+    make_controls(control_by_name)
     completed: dict[str, Control | Mapping[str, object]] = {}
     for name, control in control_by_name.items():
         if isinstance(control, Control):
@@ -332,12 +338,12 @@ def given_to(
             completed[name] = control
         else:
             completed[name] = {**_run_settings_of(config, name, control), **control}
-    return as_controls(completed)
+    return make_controls(completed)
 
 
 def _check_takes_no_run_setting(config: SceneConfig, control: Control) -> None:
     """Raise InputError if an instance would take a setting that the run states."""
-    for choice in _list_active_choices(type(control), control.settings()):
+    for choice in _list_active_choices(type(control), control.to_settings()):
         if getattr(config, choice.run_setting, None) is not None:
             raise InputError(
                 f"{choice.run_setting}: control {control.name} was given as an "
@@ -354,7 +360,7 @@ def _run_settings_of(
     for choice in _list_choices(qualified_name, control_settings) or ():
         value = getattr(config, choice.run_setting, None)
         if isinstance(value, Mapping):
-            _, instance_name = names_of(qualified_name, control_settings)
+            _, instance_name = parse_control_name(qualified_name, control_settings)
             value = value.get(instance_name)
         # A tuple is a curve of epsilons: each of its runs has a single one.
         if value is not None and not isinstance(value, tuple):
@@ -362,21 +368,21 @@ def _run_settings_of(
     return run_settings
 
 
-def settings_alone(
-    config: SceneConfig, asked: str, given: Mapping[str, object]
+def select_run_settings(
+    config: SceneConfig, qualified_name: str, control_settings: Mapping[str, object]
 ) -> dict[str, Any]:
     """Return the run's settings for a run over a single one of its controls.
 
     Args:
         config: of the run over all controls.
-        asked: kind and name of the control, as the configuration has it.
-        given: settings of the control.
+        qualified_name: kind and name of the control, as the configuration has it.
+        control_settings: settings of the control.
 
     Returns:
         A value for each of `RUN_SETTINGS`; None for those that the control does not
         take.
     """
-    _, instance_name = names_of(asked, given)
+    _, instance_name = parse_control_name(qualified_name, control_settings)
     run_settings = {}
     for setting in RUN_SETTINGS:
         value = getattr(config, setting, None)
@@ -386,7 +392,9 @@ def settings_alone(
                 if instance_name in value
                 else None
             )
-        run_settings[setting] = value if takes(asked, given, setting) else None
+        run_settings[setting] = (
+            value if takes_setting(qualified_name, control_settings, setting) else None
+        )
     return run_settings
 
 
@@ -404,12 +412,12 @@ def check_run_settings(config: SceneConfig) -> None:
         if value is None:
             continue
         random_controls = {} if setting == "epsilon" else getattr(config, "over", {})
-        controls = gathered({**config.controls, **random_controls})
+        controls = merge_control_settings({**config.controls, **random_controls})
         # kind of each control that does not take the setting
         rejecting_kinds = {
-            name: names_of(name, control_settings)[0]
+            name: parse_control_name(name, control_settings)[0]
             for name, control_settings in controls.items()
-            if not takes(name, control_settings, setting)
+            if not takes_setting(name, control_settings, setting)
         }
         if isinstance(value, Mapping):
             _check_named_controls(setting, value, controls, rejecting_kinds)
@@ -428,7 +436,7 @@ def _check_named_controls(
 ) -> None:
     """Check the controls that a setting names: they are there, and take it."""
     qualified_names = {
-        names_of(qualified_name, control_settings)[1]: qualified_name
+        parse_control_name(qualified_name, control_settings)[1]: qualified_name
         for qualified_name, control_settings in controls.items()
     }
     for name in names:
@@ -439,12 +447,14 @@ def _check_named_controls(
             raise _make_not_taken_error(setting, name, kind)
 
 
-def takes(asked: str, given: Mapping[str, object], setting: str) -> bool:
+def takes_setting(
+    qualified_name: str, control_settings: Mapping[str, object], setting: str
+) -> bool:
     """Return whether a control takes one of the run's settings.
 
     A control that is not known counts as one that does.
     """
-    choices = _list_choices(asked, given)
+    choices = _list_choices(qualified_name, control_settings)
     return choices is None or setting in {choice.run_setting for choice in choices}
 
 
@@ -452,8 +462,10 @@ def _list_choices(
     qualified_name: str, control_settings: Mapping[str, object]
 ) -> list[Choice] | None:
     """List the active choices of a control; None if its kind is not known."""
-    ((name, settings),) = gathered({qualified_name: control_settings}).items()
-    kind, _ = names_of(name, settings)
+    ((name, settings),) = merge_control_settings(
+        {qualified_name: control_settings}
+    ).items()
+    kind, _ = parse_control_name(name, settings)
     if kind not in CONTROLS:
         return None
     return _list_active_choices(CONTROLS[kind], settings)
@@ -516,7 +528,7 @@ The threads of torch and Dr.Jit, and warnings that are caught, belong to the pro
 
 
 @contextmanager
-def in_turn() -> Iterator[None]:
+def hold_process_lock() -> Iterator[None]:
     """Run the block while no other thread of the process runs an experiment.
 
     Derivatives are on in it, whatever the caller has switched off (`torch.no_grad`,

@@ -22,33 +22,37 @@ from advsearch.attacks import Domain, Evaluation, Objective
 from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
-from advsearch.engine.acceptance import ComparedView, view_of
+from advsearch.engine.acceptance import ComparedView, compare_with_traced
 from advsearch.engine.judging import (
     ConfigurationInputs,
-    Described,
-    Looked,
+    DescribeConfiguration,
     Metrics,
-    domain_of,
-    judgements,
+    RenderSurfaces,
+    add_visible_things,
+    judge_images,
+    make_domain,
     mean_metrics,
-    with_things,
 )
-from advsearch.engine.rendering import looks_at, things_seen
+from advsearch.engine.rendering import find_visible_things, list_camera_renders
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import Value
 from advsearch.runs.results import GroupDerivative, PlannedGradient
-from advsearch.scene.color import to_8_bit
-from advsearch.scene.description import NO_MAP
+from advsearch.scene.color import round_to_8_bit
+from advsearch.scene.description import NO_ENVIRONMENT
 from advsearch.scene.gradients import GradientPlan, Group
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.lights import why_not
-from advsearch.scene.transport.matrix import Linearised, LinearRenderer, linear_inputs
+from advsearch.scene.transport.lights import find_refusal
+from advsearch.scene.transport.matrix import (
+    LinearizedScene,
+    LinearRenderer,
+    find_linear_inputs,
+)
 from advsearch.tasks import Facts, Judgement, Mark, Task
-from advsearch.tasks.base import Output, Truth, mean, typical
+from advsearch.tasks.base import Output, Truth, mean, most_frequent_judgement
 
 
-class Prepared(NamedTuple):
+class Preparation(NamedTuple):
     """What is measured before a search, and sent to workers with its queries.
 
     Attributes:
@@ -69,22 +73,22 @@ Many conditions with some noise and without the last light teach more than few t
 exact.
 """
 
-MOST_NUMBERS = 64
+MAX_CACHED_COORDINATES = 64
 """Coordinates, beside base colors, of a configuration whose truth is cached, at most."""
 
-MOST = 512
+MAX_CACHED_TRUTHS = 512
 """Truths that are cached, at most."""
 
 
 def _cache(cached: dict[bytes, Any], key: bytes, value: Any) -> None:
     """Add a value to a cache; the oldest ones make room."""
-    while len(cached) >= MOST:
+    while len(cached) >= MAX_CACHED_TRUTHS:
         del cached[next(iter(cached))]
     cached[key] = value
 
 
 # why nothing is computed for the conditions; a plan has it as the reason of a group
-BY_CHANCE = "forced: it varies by chance, so nobody asks for its derivative"
+VARIES_BY_CHANCE = "forced: it varies by chance, so nobody asks for its derivative"
 
 
 @dataclass
@@ -96,15 +100,15 @@ class Problem:
         space: all controls: those that are searched, then those that vary by chance.
         model: predicts what an image shows.
         task: judges the model's output, and defines success.
-        facts: returns what the task judges by, from functions that describe and render
+        make_facts: returns what the task judges by, from functions that describe and render
             a configuration.
         objective: the function that a search maximises; None of a sweep.
         spp: samples per pixel of a search.
         seed: root seed.
-        searched: how many of the controls are searched, None for all. The others are
+        n_searched: how many of the controls are searched, None for all. The others are
             the conditions: every image has new ones from their full range.
         steps: renders of a search.
-        draws: conditions of one evaluation, if there are any; the objective is their
+        n_draws: conditions of one evaluation, if there are any; the objective is their
             mean.
         search_depth: segments of the longest light path in a search; None for that of
             the scene.
@@ -119,13 +123,13 @@ class Problem:
     space: Space
     model: Model
     task: Task
-    facts: Callable[[Described, Looked], Facts]
+    make_facts: Callable[[DescribeConfiguration, RenderSurfaces], Facts]
     objective: Objective | None
     spp: int
     seed: int
-    searched: int | None = None
+    n_searched: int | None = None
     steps: int = 0
-    draws: int = 1
+    n_draws: int = 1
     search_depth: int | None = None
     aovs: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
@@ -149,7 +153,7 @@ class Problem:
         The cost of the domain is updated.
         """
         controls = self.space.controls
-        n_searched = len(controls) if self.searched is None else self.searched
+        n_searched = len(controls) if self.n_searched is None else self.n_searched
         searched = controls[:n_searched]
         conditions = controls[n_searched:]
         condition_names = {control.name for control in conditions}
@@ -158,21 +162,21 @@ class Problem:
             for group in plan.groups
             if group.control in condition_names
         }
-        self.renderer.plan = plan.with_estimator(estimator_by_group, BY_CHANCE)
-        self.domain = domain_of(
+        self.renderer.plan = plan.force_estimators(estimator_by_group, VARIES_BY_CHANCE)
+        self.domain = make_domain(
             searched, gradient_cost=self.renderer.plan.renders, partial_gradients=True
         )
-        self.conditions = domain_of(conditions) if conditions else None
+        self.conditions = make_domain(conditions) if conditions else None
 
     @property
-    def prepared(self) -> Prepared:
+    def preparation(self) -> Preparation:
         """What another process needs to evaluate the same problem."""
-        return Prepared(self.spp, self.search_depth, self.plan)
+        return Preparation(self.spp, self.search_depth, self.plan)
 
     @cached_property
     def searched_space(self) -> Space:
         """The space of the searched controls alone."""
-        return replace(self.space, controls=self.space.controls[: self.searched])
+        return replace(self.space, controls=self.space.controls[: self.n_searched])
 
     @property
     def environment(self) -> str:
@@ -180,13 +184,16 @@ class Problem:
         if self.space.environment:
             return self.space.environment
         scene = self.space.scene
-        return NO_MAP if scene is None else scene.environment_name
+        return NO_ENVIRONMENT if scene is None else scene.environment_name
 
     @property
     def is_linear(self) -> bool:
         """Whether matrices of light transport predict the images of this problem."""
-        conditions = self.space.controls[self.searched :]
-        return why_not(self.renderer, [control.name for control in conditions]) is None
+        conditions = self.space.controls[self.n_searched :]
+        return (
+            find_refusal(self.renderer, [control.name for control in conditions])
+            is None
+        )
 
     @property
     def rule(self) -> Rule:
@@ -197,72 +204,78 @@ class Problem:
 
     # ---- pictures
 
-    def whole(self, u: Tensor, draw: int | None = None) -> Tensor:
+    def add_conditions(self, u: Tensor, draw_seed: int | None = None) -> Tensor:
         """Return the full configuration: u (d,), and conditions behind it.
 
-        `draw` is the seed of the conditions; without, they are those that leave the
+        `draw_seed` is the seed of the conditions; without, they are those that leave the
         scene unchanged.
         """
         if self.conditions is None:
             return u
-        if draw is None:
+        if draw_seed is None:
             return torch.cat([u, self.conditions.start])
-        generator = torch.Generator().manual_seed(seeds.stream(draw, "conditions"))
+        generator = torch.Generator().manual_seed(seeds.stream(draw_seed, "conditions"))
         return torch.cat([u, self.conditions.sample(generator)[0]])
 
-    def picture(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Tensor:
+    def picture(
+        self, u: Tensor, seed: int, spp: int, *, with_conditions: bool = True
+    ) -> Tensor:
         """Render a configuration as a file would hold it.
 
         Args:
             u: (d,) the configuration.
             seed: of the noise and, if they are drawn, of the conditions.
             spp: samples per pixel.
-            drawn: whether conditions are drawn; else they leave the scene unchanged.
+            with_conditions: whether conditions are drawn; else they leave the scene unchanged.
 
         Returns:
             (H, W, 3) sRGB in [0, 1], rounded to 8 bits.
         """
-        full_u = self.whole(u, seed if drawn else None)
+        full_u = self.add_conditions(u, seed if with_conditions else None)
         with torch.no_grad():
-            return to_8_bit(self.renderer(full_u, seed=seed, spp=spp))
+            return round_to_8_bit(self.renderer(full_u, seed=seed, spp=spp))
 
-    def judge(self, picture: Tensor, whole: Tensor) -> Judgement:
+    def judge(self, image: Tensor, full_u: Tensor) -> Judgement:
         """Judge an image (H, W, 3) of a full configuration, with its objective."""
         if self.objective is None:
-            return self.judge_several(picture[None], [whole], [{}])[0]
+            return self.judge_images(image[None], [full_u], [{}])[0]
         with torch.no_grad():
-            output = self.model(picture)
-            truth = self.truth(whole)
-            values = self.objective(output, picture[None], truth, self.asked(whole))
-            (judgement,) = self._judge_outputs(output, picture[None], [truth], [whole])
+            output = self.model(image)
+            truth = self.find_truth(full_u)
+            values = self.objective(
+                output, image[None], truth, self.make_objective_inputs(full_u)
+            )
+            (judgement,) = self._judge_outputs(output, image[None], [truth], [full_u])
             return replace(judgement, objective=float(values[0]))
 
-    def judge_several(
+    def judge_images(
         self,
-        pictures: Tensor,
-        wholes: Sequence[Tensor],
-        listed: Sequence[Mapping[str, Value]],
+        images: Tensor,
+        full_configurations: Sequence[Tensor],
+        stated_values: Sequence[Mapping[str, Value]],
     ) -> list[Judgement]:
         """Judge images that the model sees in one batch, without an objective.
 
         A margin that is not finite becomes NaN.
 
         Args:
-            pictures: (N, H, W, 3).
-            wholes: N full configurations.
-            listed: N mappings of values that replace those of the configurations, as
+            images: (N, H, W, 3).
+            full_configurations: N full configurations.
+            stated_values: N mappings of values that replace those of the configurations, as
                 for `truth`.
         """
         with torch.no_grad():
-            output = self.model(pictures)
+            output = self.model(images)
             if self.task.varies:
                 truths = [
-                    self.truth(full_u, values)
-                    for full_u, values in zip(wholes, listed, strict=False)
+                    self.find_truth(full_u, values)
+                    for full_u, values in zip(
+                        full_configurations, stated_values, strict=False
+                    )
                 ]
             else:
-                truths = [self.truth()]
-            judged = self._judge_outputs(output, pictures, truths, wholes)
+                truths = [self.find_truth()]
+            judged = self._judge_outputs(output, images, truths, full_configurations)
         judgements_without_objective = []
         for judgement in judged:
             plain = Judgement.of(
@@ -284,100 +297,106 @@ class Problem:
         full_configurations: Sequence[Tensor],
     ) -> list[Judgement]:
         """Judge images (N, H, W, 3) by task and metrics, with what each thing shows."""
-        judged = list(judgements(self.task, output, pictures, truths, self.metrics))
+        judged = list(judge_images(self.task, output, pictures, truths, self.metrics))
         if self.space.scene is None or not self.space.scene.things:
             return judged
         for index, full_u in enumerate(full_configurations):
             key = full_u.detach()[self._is_geometric].numpy().tobytes()
             if key not in self._things:
-                _cache(self._things, key, things_seen(self.renderer, full_u))
-            judged[index] = with_things(judged[index], self._things[key])
+                _cache(self._things, key, find_visible_things(self.renderer, full_u))
+            judged[index] = add_visible_things(judged[index], self._things[key])
         return judged
 
-    def view(
+    def compare_view(
         self,
         predict: Callable[[Tensor], Tensor],
-        whole: Tensor,
+        full_u: Tensor,
         seed: int,
         spp: int,
         *,
-        drawn: Tensor | None = None,
+        is_random: Tensor | None = None,
     ) -> ComparedView:
         """Compare a predicted image with traced images of the same configuration.
 
         Args:
             predict: from a full configuration to an image (H, W, 3).
-            whole: the full configuration.
+            full_u: the full configuration.
             seed: of the noise of the traced images.
             spp: samples per pixel of a rendered image.
-            drawn: (d,) bool, the searched coordinates that are random here: the search
+            is_random: (d,) bool, the searched coordinates that are random here: the search
                 has not moved them.
         """
         dim = self.domain.dim
         with torch.no_grad():
-            predicted = predict(whole)
-            start = torch.cat([self.domain.start, whole[dim:]])
-            if drawn is not None:
-                start[:dim][drawn] = whole[:dim][drawn]
-            predicted_start = None if torch.equal(start, whole) else predict(start)
+            predicted = predict(full_u)
+            start = torch.cat([self.domain.start, full_u[dim:]])
+            if is_random is not None:
+                start[:dim][is_random] = full_u[:dim][is_random]
+            predicted_start = None if torch.equal(start, full_u) else predict(start)
 
         def measure_margin(image: Tensor, u: Tensor) -> float:
             return self.judge(image, u).margin
 
-        return view_of(
-            self.renderer, predicted, whole, seed, spp, measure_margin, predicted_start
+        return compare_with_traced(
+            self.renderer, predicted, full_u, seed, spp, measure_margin, predicted_start
         )
 
-    def marks(self, picture: Tensor, whole: Tensor) -> list[Mark]:
+    def find_marks(self, image: Tensor, full_u: Tensor) -> list[Mark]:
         """Return the marks of the model's prediction on an image (H, W, 3)."""
-        return self.seen(picture, whole)[1]
+        return self.predict_with_marks(image, full_u)[1]
 
-    def seen(self, picture: Tensor, whole: Tensor) -> tuple[bool, list[Mark]]:
+    def predict_with_marks(
+        self, image: Tensor, full_u: Tensor
+    ) -> tuple[bool, list[Mark]]:
         """Return whether the model is right on an image (H, W, 3), and its marks."""
         with torch.no_grad():
-            output = self.model(picture)
-            truth = self.truth(whole)
+            output = self.model(image)
+            truth = self.find_truth(full_u)
             is_right = self.task.judge(output, truth)[0].right
             return is_right, self.task.marks(output, truth)[0]
 
-    def truth(
-        self, whole: Tensor | None = None, listed: Mapping[str, Value] | None = None
+    def find_truth(
+        self,
+        full_u: Tensor | None = None,
+        stated_values: Mapping[str, Value] | None = None,
     ) -> Truth:
         """Return what is true of the scene at a full configuration; None for the start.
 
-        Values that are `listed` replace those of the configuration, which has single
+        Values that are `stated_values` replace those of the configuration, which has single
         precision only.
         """
-        if whole is None or not self.task.varies:
+        if full_u is None or not self.task.varies:
             return self._start_truth
         # What the camera sees first does not depend on base colors. So a truth is cached
         # if few other coordinates exist, unless the task reads numbers.
-        geometric_u = whole.detach()[self._is_geometric]
+        geometric_u = full_u.detach()[self._is_geometric]
         key = geometric_u.numpy().tobytes()
-        if not listed and key in self._truths:
+        if not stated_values and key in self._truths:
             return self._truths[key]
 
         def describe() -> dict[str, Value]:
-            values = self.space.describe(whole)
-            return {name: (listed or {}).get(name, values[name]) for name in values}
+            values = self.space.describe(full_u)
+            return {
+                name: (stated_values or {}).get(name, values[name]) for name in values
+            }
 
         n_rig_cameras = 0 if self.space.scene is None else len(self.space.scene.rig)
-        looks = looks_at(self.renderer, whole, n_rig_cameras)
-        facts, *camera_facts = [self.facts(describe, look) for look in looks]
+        looks = list_camera_renders(self.renderer, full_u, n_rig_cameras)
+        facts, *camera_facts = [self.make_facts(describe, look) for look in looks]
         facts = replace(facts, views=tuple(camera_facts))
         truth = self.task.truth(facts)
-        is_cacheable = not listed and len(geometric_u) <= MOST_NUMBERS
+        is_cacheable = not stated_values and len(geometric_u) <= MAX_CACHED_COORDINATES
         if is_cacheable and "numbers" not in vars(facts):
             _cache(self._truths, key, truth)
         return truth
 
     @cached_property
     def _start_truth(self) -> Truth:
-        start = self.whole(self.domain.start)
+        start = self.add_conditions(self.domain.start)
         if self.task.varies:
-            return self.truth(start)
+            return self.find_truth(start)
         return self.task.truth(
-            self.facts(
+            self.make_facts(
                 lambda: self.space.describe(start),
                 lambda: self.renderer.surfaces(start),
             )
@@ -386,27 +405,29 @@ class Problem:
     @cached_property
     def _is_geometric(self) -> Tensor:
         """Which coordinates do more than to color surfaces, (d,) bool."""
-        color_inputs = linear_inputs(self.renderer)
+        color_inputs = find_linear_inputs(self.renderer)
         is_geometric = torch.ones(len(self.space.start), dtype=torch.bool)
         for group in self.space.groups:
             route = self.renderer.routes.get(group.name)
             is_geometric[group.coordinates] = not route or not route <= color_inputs
         return is_geometric
 
-    def asked(self, *wholes: Tensor) -> ConfigurationInputs:
+    def make_objective_inputs(
+        self, *full_configurations: Tensor
+    ) -> ConfigurationInputs:
         """Return the inputs that an objective may read at full configurations."""
-        return ConfigurationInputs(self.space, self.searched_space, wholes)
+        return ConfigurationInputs(self.space, self.searched_space, full_configurations)
 
-    def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
+    def describe(self, u: Tensor, draw_seed: int | None = None) -> dict[str, Value]:
         """Describe the searched controls of a configuration in values with units.
 
-        `draw` is the seed of the conditions; without, they leave the scene unchanged.
+        `draw_seed` is the seed of the conditions; without, they leave the scene unchanged.
         """
         return self.space.describe(
-            self.whole(u, draw), self.space.controls[: self.searched]
+            self.add_conditions(u, draw_seed), self.space.controls[: self.n_searched]
         )
 
-    def plan_summary(self, plan: GradientPlan) -> PlannedGradient:
+    def summarize_plan(self, plan: GradientPlan) -> PlannedGradient:
         """Return what a result stores of a plan, each step in its parameter's unit."""
         groups = []
         for group, row in zip(plan.groups, plan.to_dict()["groups"], strict=True):
@@ -424,7 +445,7 @@ class Problem:
         """
         if not group.step_reason or group.size != 1:
             return None, ""
-        u = self.whole(self.domain.start).clone()
+        u = self.add_conditions(self.domain.start).clone()
         half_step = min(group.step, 0.5)
         u[group.coordinates] = 0.5 - half_step
         lower = self.space.describe(u).get(group.name)
@@ -437,43 +458,43 @@ class Problem:
         difference = float(upper["value"]) - float(lower["value"])
         return abs(difference) / 2.0, lower["unit"]
 
-    def conditions_of(self, u: Tensor, draw: int) -> dict[str, Value]:
+    def describe_conditions(self, u: Tensor, draw_seed: int) -> dict[str, Value]:
         """Describe the conditions of a draw in values with units; {} without conditions."""
         if self.conditions is None:
             return {}
         return self.space.describe(
-            self.whole(u, draw), self.space.controls[self.searched :]
+            self.add_conditions(u, draw_seed), self.space.controls[self.n_searched :]
         )
 
     # ---- evaluations
 
     def evaluate_all(
-        self, queries: Sequence[Query], prepared: Prepared | None = None
+        self, queries: Sequence[Query], preparation: Preparation | None = None
     ) -> Iterator[Evaluation]:
         """Evaluate queries lazily, in their order.
 
-        `prepared` is what another process has prepared the same problem with.
+        `preparation` is what another process has prepared the same problem with.
         """
-        if prepared is not None:
-            self.spp = prepared.spp
-            self.search_depth = prepared.search_depth
-            if self.plan != prepared.plan:
-                self.plan = prepared.plan
+        if preparation is not None:
+            self.spp = preparation.spp
+            self.search_depth = preparation.search_depth
+            if self.plan != preparation.plan:
+                self.plan = preparation.plan
         return map(self.evaluate, queries)
 
     def evaluate(self, query: Query) -> Evaluation:
         """Evaluate one query: a run renders, predicts and judges here only."""
         non_finite_before = self.renderer.non_finite
-        if query.wanted == "light":
-            linear = self.linearised(query.u, query.seed, query.spp)
+        if query.product == "light":
+            linear = self.make_linear_renderer(query.u, query.seed, query.spp)
             evaluation = Evaluation(math.nan, None, False, light=linear.collected)
-        elif query.wanted == "picture":
+        elif query.product == "picture":
             image = self.picture(query.u, query.seed, query.spp)
             evaluation = Evaluation(math.nan, None, False, picture=image)
         elif query.phase is None:
             evaluation = self._evaluate_trial(query)
         elif self.conditions is None:
-            evaluation, _ = self.evaluated(query, query.u, query.seed)
+            evaluation, _ = self.evaluate_full(query, query.u, query.seed)
         else:
             evaluation = self._evaluate_over_conditions(query)
         n_non_finite = self.renderer.non_finite - non_finite_before
@@ -483,25 +504,33 @@ class Problem:
 
     def _evaluate_trial(self, query: Query) -> Evaluation:
         """Evaluate a trial: judge the image as a file would hold it."""
-        image = self.picture(query.u, query.seed, query.spp, drawn=query.drawn)
-        full_u = self.whole(query.u, query.seed if query.drawn else None)
+        image = self.picture(
+            query.u, query.seed, query.spp, with_conditions=query.draws_conditions
+        )
+        full_u = self.add_conditions(
+            query.u, query.seed if query.draws_conditions else None
+        )
         judgement = self.judge(image, full_u)
-        return Evaluation.of(judgement, picture=image if query.keep else None)
+        return Evaluation.from_judgement(
+            judgement, picture=image if query.with_image else None
+        )
 
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
         """Evaluate a query of a search: the mean over conditions that are drawn."""
         condition_seeds = [
-            seeds.stream(query.seed, "draw", index) for index in range(self.draws)
+            seeds.stream(query.seed, "draw", index) for index in range(self.n_draws)
         ]
-        query_without_image = replace(query, keep=False)
+        query_without_image = replace(query, with_image=False)
         evaluated = [
-            self.evaluated(query_without_image, self.whole(query.u, seed), seed)
+            self.evaluate_full(
+                query_without_image, self.add_conditions(query.u, seed), seed
+            )
             for seed in condition_seeds
         ]
-        evaluation = self.mean(evaluated, query.u)
-        if not query.keep:
+        evaluation = self.average_evaluations(evaluated, query.u)
+        if not query.with_image:
             return evaluation
-        image = self.picture(query.u, query.seed, self.spp, drawn=False)
+        image = self.picture(query.u, query.seed, self.spp, with_conditions=False)
         return replace(evaluation, picture=image)
 
     def _compute_objective(
@@ -516,16 +545,20 @@ class Problem:
             raise RuntimeError("a sweep has no objective")
         return self.objective(outputs, pictures, truth, inputs)
 
-    def linearised(
-        self, whole: Tensor, seed: int, spp: int, collected: Linearised | None = None
+    def make_linear_renderer(
+        self,
+        full_u: Tensor,
+        seed: int,
+        spp: int,
+        collected_light: LinearizedScene | None = None,
     ) -> LinearRenderer:
         """Return a renderer that predicts images near a full configuration.
 
         Args:
-            whole: the full configuration.
+            full_u: the full configuration.
             seed: of the noise.
             spp: samples per pixel.
-            collected: light that was collected there; None to collect it now.
+            collected_light: light that was collected there; None to collect it now.
         """
         searched_names = {control.name for control in self.searched_space.controls}
         searched_groups = [
@@ -534,27 +567,27 @@ class Problem:
         routes = [
             self.renderer.routes.get(name, frozenset()) for name in searched_groups
         ]
-        input_names = frozenset().union(*routes) & linear_inputs(self.renderer)
+        input_names = frozenset().union(*routes) & find_linear_inputs(self.renderer)
         depth = min(LIGHT_DEPTH, self.search_depth or LIGHT_DEPTH)
-        with self.renderer.scene.shorter(depth):
+        with self.renderer.scene.limit_depth(depth):
             return LinearRenderer(
                 self.renderer,
-                whole,
+                full_u,
                 seed,
                 spp=spp,
                 quick=True,
                 names=input_names,
-                collected=collected,
+                collected=collected_light,
             )
 
-    def evaluated(
-        self, query: Query, whole: Tensor, seed: int, renderer: Renderer | None = None
+    def evaluate_full(
+        self, query: Query, full_u: Tensor, seed: int, renderer: Renderer | None = None
     ) -> tuple[Evaluation, Output]:
         """Evaluate a query of a search by one image of a full configuration.
 
         Args:
             query: of a search.
-            whole: the full configuration.
+            full_u: the full configuration.
             seed: of the noise.
             renderer: another one than that of the problem, such as a predictor.
 
@@ -564,9 +597,9 @@ class Problem:
         renderer = self.renderer if renderer is None else renderer
         non_finite_before = renderer.non_finite
         renders_before = renderer.renders
-        truth = self.truth(whole)
-        variable_u = whole.detach().clone().requires_grad_(bool(query.gradient))
-        inputs = self.asked(variable_u)
+        truth = self.find_truth(full_u)
+        variable_u = full_u.detach().clone().requires_grad_(bool(query.gradient))
+        inputs = self.make_objective_inputs(variable_u)
         # image and output of each call of the loss; the first is that of u itself
         calls: list[tuple[Tensor, Output]] = []
         input_gradient = torch.zeros(())
@@ -591,15 +624,15 @@ class Problem:
         with self._limit_search_depth(renderer):
             if query.gradient:
                 value, gradient = renderer.gradient(
-                    loss, whole, seed, spp, free=query.gradient == "free"
+                    loss, full_u, seed, spp, free=query.gradient == "free"
                 )
                 if inputs.used:
                     gradient = gradient + input_gradient
             else:
                 with torch.no_grad():
-                    value = loss(renderer(whole, seed=seed, spp=spp))
+                    value = loss(renderer(full_u, seed=seed, spp=spp))
         image, output = calls[0]
-        (judgement,) = self._judge_outputs(output, image[None], [truth], [whole])
+        (judgement,) = self._judge_outputs(output, image[None], [truth], [full_u])
         evaluation = Evaluation(
             float(value),
             gradient,
@@ -607,7 +640,7 @@ class Problem:
             renderer.non_finite - non_finite_before,
             cost=max(1, renderer.renders - renders_before) * query.samples,
             judgement=judgement,
-            picture=to_8_bit(image) if query.keep else None,
+            picture=round_to_8_bit(image) if query.with_image else None,
         )
         return evaluation, output
 
@@ -615,12 +648,12 @@ class Problem:
         """Shorten the light paths of a renderer to those of a search in a block."""
         if self.search_depth is None:
             return nullcontext()
-        return renderer.scene.shorter(self.search_depth)
+        return renderer.scene.limit_depth(self.search_depth)
 
-    def judged(
+    def evaluate_batch(
         self,
         render: Callable[[Tensor], Tensor],
-        wholes: Sequence[Tensor],
+        full_configurations: Sequence[Tensor],
         u: Tensor,
         gradient: WhichGradient,
     ) -> tuple[list[tuple[Evaluation, Output]], Tensor | None]:
@@ -628,29 +661,32 @@ class Problem:
 
         Args:
             render: from u (d,) to images (N, H, W, 3), with a graph.
-            wholes: full configuration of each image.
+            full_configurations: full configuration of each image.
             u: (d,) the searched coordinates, equal in all of them.
             gradient: whether a derivative is computed.
 
         Returns:
             An evaluation without derivative and the model's output for each image, and
             the derivative (d,) of the sum of their objectives, weighted by
-            `hard_first`.
+            `compute_condition_weights`.
         """
         variable_u = u.detach().clone().requires_grad_(bool(gradient))
         with torch.set_grad_enabled(bool(gradient)):
             images = render(variable_u)
             outputs = self.model(images)
             outputs_of_images = [
-                outputs[index : index + 1] for index in range(len(wholes))
+                outputs[index : index + 1] for index in range(len(full_configurations))
             ]
-            truths = [self.truth(full_u) for full_u in wholes]
+            truths = [self.find_truth(full_u) for full_u in full_configurations]
             variable_configurations = [
-                torch.cat([variable_u, full_u[len(variable_u) :]]) for full_u in wholes
+                torch.cat([variable_u, full_u[len(variable_u) :]])
+                for full_u in full_configurations
             ]
             if self.task.varies:
                 objectives = [
-                    self._compute_objective(output, image, truth, self.asked(full_u))
+                    self._compute_objective(
+                        output, image, truth, self.make_objective_inputs(full_u)
+                    )
                     for output, image, truth, full_u in zip(
                         outputs_of_images,
                         images.split(1),
@@ -661,43 +697,43 @@ class Problem:
                 ]
                 values = torch.cat(objectives)
             else:
-                inputs = self.asked(*variable_configurations)
+                inputs = self.make_objective_inputs(*variable_configurations)
                 values = self._compute_objective(outputs, images, truths[0], inputs)
             derivative = torch.zeros_like(u) if gradient else None
             if values.requires_grad:
-                weighted_sum = (values * hard_first(values)).sum()
+                weighted_sum = (values * compute_condition_weights(values)).sum()
                 (derivative,) = torch.autograd.grad(weighted_sum, variable_u)
-        judged = self._judge_outputs(outputs, images, truths, wholes)
+        judged = self._judge_outputs(outputs, images, truths, full_configurations)
         evaluations = [
             Evaluation(float(value), None, judgement.success, judgement=judgement)
             for value, judgement in zip(values.detach(), judged, strict=True)
         ]
         return list(zip(evaluations, outputs_of_images, strict=True)), derivative
 
-    def mean_under(
+    def evaluate_conditions(
         self,
         render: Callable[[slice, Tensor], Tensor],
-        wholes: Sequence[Tensor],
+        full_configurations: Sequence[Tensor],
         u: Tensor,
         gradient: WhichGradient,
-        at_once: int,
+        batch_size: int,
     ) -> Evaluation:
         """Evaluate the mean over conditions whose images are predicted.
 
         Args:
             render: from a slice of the conditions and u to images (N, H, W, 3), with a
                 graph.
-            wholes: full configuration of each condition.
+            full_configurations: full configuration of each condition.
             u: (d,) the searched coordinates.
             gradient: whether a derivative is computed.
-            at_once: images in a batch of the model.
+            batch_size: images in a batch of the model.
         """
         evaluated = []
         total_derivative = None
-        for begin in range(0, len(wholes), at_once):
-            batch = slice(begin, begin + at_once)
-            batch_evaluated, derivative = self.judged(
-                partial(render, batch), wholes[batch], u, gradient
+        for begin in range(0, len(full_configurations), batch_size):
+            batch = slice(begin, begin + batch_size)
+            batch_evaluated, derivative = self.evaluate_batch(
+                partial(render, batch), full_configurations[batch], u, gradient
             )
             evaluated += batch_evaluated
             if total_derivative is None:
@@ -706,10 +742,10 @@ class Problem:
                 total_derivative = total_derivative + derivative
         mean_derivative = None
         if total_derivative is not None:
-            mean_derivative = total_derivative / len(wholes)
-        return self.mean(evaluated, u, mean_derivative)
+            mean_derivative = total_derivative / len(full_configurations)
+        return self.average_evaluations(evaluated, u, mean_derivative)
 
-    def mean(
+    def average_evaluations(
         self,
         evaluated: Sequence[tuple[Evaluation, Output]],
         u: Tensor,
@@ -741,7 +777,7 @@ class Problem:
         ]
         judgement = self._mean_judgement(judged, outputs)
         n_successes = sum(evaluation.success for evaluation in evaluations)
-        n_needed = OVER_CONDITIONS.share(len(evaluations))
+        n_needed = OVER_CONDITIONS.count_percent(len(evaluations))
         total_objective = sum(evaluation.objective for evaluation in evaluations)
         return Evaluation(
             total_objective / len(evaluations),
@@ -761,23 +797,23 @@ class Problem:
         judges the average of the outputs.
         """
         if self.task.varies:
-            usual = typical(judged)
+            usual = most_frequent_judgement(judged)
             score = mean([judgement.score for judgement in judged])
             margin = mean([judgement.margin for judgement in judged])
             return Judgement.of(score, margin, usual.prediction, usual.payload)
         with torch.no_grad():
             output = self.task.average(list(outputs))
-            return self.task.judge(output, self.truth())[0]
+            return self.task.judge(output, self.find_truth())[0]
 
-    def loss(self, image: Tensor) -> Tensor:
+    def compute_loss(self, image: Tensor) -> Tensor:
         """Return the objective of an image (H, W, 3) near the start, with a graph."""
-        inputs = self.asked(self.whole(self.domain.start))
+        inputs = self.make_objective_inputs(self.add_conditions(self.domain.start))
         output = self.model(image)
-        values = self._compute_objective(output, image[None], self.truth(), inputs)
+        values = self._compute_objective(output, image[None], self.find_truth(), inputs)
         return values[0]
 
 
-def hard_first(values: Tensor) -> Tensor:
+def compute_condition_weights(values: Tensor) -> Tensor:
     """Return weights (n,) of conditions in a derivative, by their objectives (n,).
 
     The smaller the objective of a condition is, the larger is its weight. The mean

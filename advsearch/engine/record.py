@@ -27,11 +27,11 @@ from advsearch.scene.predictor import Refusal
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.base import mean
 
-KEPT = 4  # images of each group of trials that are stored
+MAX_STORED_IMAGES = 4  # images of each group of trials that are stored
 
 
 @dataclass
-class Findings:
+class RunState:
     """The results of a run so far; what is None or empty was not reached."""
 
     # renders of the clean configuration at the search's sample count
@@ -40,7 +40,7 @@ class Findings:
     search: SearchResult | None = None
     baseline: SearchResult | None = None  # the same of the random search
     sample_count: SampleCount | None = None  # how that of the verification was chosen
-    clean: tuple[Judgement, ...] = ()  # the control group's trials
+    clean_trials: tuple[Judgement, ...] = ()  # the control group's trials
     verification: Verification | None = None
     baseline_verification: Verification | None = None
     # of the policy without print terms, where the search has them
@@ -48,28 +48,28 @@ class Findings:
     unprinted_verification: Verification | None = None
     # of what the policy found, where the random search's is worse for the model and the
     # run's adversarial scene instead
-    beaten: Verification | None = None
+    outdone_verification: Verification | None = None
     # of the first of the different failures that the policy found
-    failures: tuple[Verification, ...] = ()
+    failure_verifications: tuple[Verification, ...] = ()
     # of a projector's picture in other light, by lux
-    ambient: dict[float, Verification] = field(default_factory=dict)
+    ambient_verifications: dict[float, Verification] = field(default_factory=dict)
     # trials of configurations drawn from the whole space
-    average: tuple[Judgement, ...] = ()
-    smallest: Bracket | None = None
+    random_trials: tuple[Judgement, ...] = ()
+    bracket: Bracket | None = None
     # of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of
     # a run that goes on only its own
-    pictures: dict[tuple[str, int], Tensor] = field(default_factory=dict)
+    trial_images: dict[tuple[str, int], Tensor] = field(default_factory=dict)
     # of the search, (H, W, 3) 8-bit values in [0, 1], numpy
     frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
     # what predicted the pictures of the searches, if anything did
-    transport: PredictedSearch | None = None
-    rendered_because: Refusal | None = None  # why nothing did
+    predictor: PredictedSearch | None = None
+    predictor_refusal: Refusal | None = None  # why nothing did
     # why matrices did and not light on surfaces, where that was tried
-    surface_refused: Refusal | None = None
+    surface_light_refusal: Refusal | None = None
     # renders spent on choosing the sample count and on trials
     verification_renders: int = 0
-    predicted_trials: int = 0
+    n_predicted_trials: int = 0
 
     @property
     def spp(self) -> int:
@@ -83,39 +83,39 @@ class Findings:
     @property
     def transport_summary(self) -> LinearTransport:
         """How the images of the searches were predicted, or why they were not."""
-        if self.transport is None:
-            reason = str(self.rendered_because or "nothing was searched")
+        if self.predictor is None:
+            reason = str(self.predictor_refusal or "nothing was searched")
             return LinearTransport(used=False, reason=reason)
-        summary = self.transport.summary()
-        if summary.reason or not self.surface_refused:
+        summary = self.predictor.summarize()
+        if summary.reason or not self.surface_light_refusal:
             return summary
-        return summary.model_copy(update={"reason": str(self.surface_refused)})
+        return summary.model_copy(update={"reason": str(self.surface_light_refusal)})
 
 
 # the label of an image whose workers all died; the payload of its row has the reason
-LOST = "(no answer)"
+LOST_LABEL = "(no answer)"
 
 
-def lost_remarks(lost: int) -> list[str]:
+def make_lost_remarks(n_lost: int) -> list[str]:
     """Return a sentence about the images whose workers all died, if there are any."""
-    if not lost:
+    if not n_lost:
         return []
-    verb, pronoun = ("has", "it") if lost == 1 else ("have", "them")
+    verb, pronoun = ("has", "it") if n_lost == 1 else ("have", "them")
     return [
-        f"{count(lost, 'picture')} {verb} no answer, which counts as not right: "
+        f"{count(n_lost, 'picture')} {verb} no answer, which counts as not right: "
         f"every worker that took {pronoun} died."
     ]
 
 
-def trial_row(
+def make_trial_row(
     kind: str,
     number: int,
     seed: int | None,
     spp: int,
-    trial: Judgement,
+    judgement: Judgement,
     values: Mapping[str, Value] | None = None,
     *,
-    sought: bool = True,
+    has_success: bool = True,
 ) -> Row:
     """Return the row that the store has of a trial.
 
@@ -124,24 +124,24 @@ def trial_row(
         number: of the trial among those of the kind.
         seed: of the noise; None for a predicted image.
         spp: samples per pixel.
-        trial: its judgement.
+        judgement: its judgement.
         values: of the configuration.
-        sought: whether a search seeks some prediction; else the row has no success.
+        has_success: whether a search seeks some prediction; else the row has no success.
     """
     row = Row(
         kind,
         number,
         seed=seed,
         spp=spp,
-        objective=_none_if_nan(trial.objective),
-        success=trial.success if sought else None,
+        objective=_none_if_nan(judgement.objective),
+        success=judgement.success if has_success else None,
         values=values or {},
         renders=1,
     )
-    return judged(row, trial)
+    return add_judgement(row, judgement)
 
 
-def judged(row: Row, judgement: Judgement) -> Row:
+def add_judgement(row: Row, judgement: Judgement) -> Row:
     """Return a row with the values of a judgement."""
     prediction = judgement.prediction
     return replace(
@@ -149,7 +149,7 @@ def judged(row: Row, judgement: Judgement) -> Row:
         score=_none_if_nan(judgement.score),
         correct=judgement.right,
         margin=_none_if_nan(judgement.margin),
-        label=None if judgement.not_a_number else prediction.label,
+        label=None if judgement.is_not_a_number else prediction.label,
         label_index=prediction.index,
         probability=prediction.probability,
         payload=judgement.payload,
@@ -161,7 +161,7 @@ def _none_if_nan(value: float | None) -> float | None:
     return None if value is None or math.isnan(value) else value
 
 
-def judgement_of(row: Row) -> Judgement:
+def read_judgement(row: Row) -> Judgement:
     """Return the judgement that a row has.
 
     A row without a label is of an output that was not a number.
@@ -178,19 +178,23 @@ def judgement_of(row: Row) -> Judgement:
     )
 
 
-def verified_rate(checked: Verification) -> VerifiedRate:
+def make_verified_rate(verification: Verification) -> VerifiedRate:
     """Return the rate of success of a verification, with labels and mean score."""
-    rate = rate_of(checked.adversarial, checked.counting, checked.successes)
-    return rate.model_copy(update={"stopped": checked.stopped})
+    rate = make_rate(
+        verification.adversarial_counts,
+        verification.valid_trials,
+        verification.successful_trials,
+    )
+    return rate.model_copy(update={"stopped": verification.stopped})
 
 
-def rate_of(
-    rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]
+def make_rate(
+    counts: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]
 ) -> VerifiedRate:
     """Return a rate as a result stores it.
 
     Args:
-        rate: counts of the trials.
+        counts: counts of the trials.
         trials: those that count; the mean score is over those that are a number.
         successes: those whose labels are counted.
     """
@@ -198,16 +202,16 @@ def rate_of(
     # 0.0 - x, and not -x: the mean of zeros is shown as 0 and not as -0.
     margin = 0.0 - mean_number(trial.score for trial in trials)
     return VerifiedRate(
-        successes=rate.successes,
-        spp=rate.spp,
+        successes=counts.successes,
+        spp=counts.spp,
         labels=dict(labels.most_common()),
         outcomes=count_outcomes(trial.payload for trial in successes),
         margin=margin,
-        **_rate_fields(rate, trials),
+        **_rate_fields(counts, trials),
     )
 
 
-def control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
+def make_control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
     """Return the trials of the clean configuration as a result stores them."""
     right = count_right(trials, spp)
     outcomes = count_outcomes(trial.payload for trial in trials if not trial.right)
@@ -218,7 +222,7 @@ def control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
 
 def _rate_fields(rate: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:
     """Return the fields that all rates of a result have."""
-    n_not_a_number = sum(trial.not_a_number for trial in trials)
+    n_not_a_number = sum(trial.is_not_a_number for trial in trials)
     return {
         "trials": rate.trials,
         "rate": rate.rate,

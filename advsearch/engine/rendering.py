@@ -12,16 +12,16 @@ import torch
 from torch import Tensor, nn
 
 from advsearch import seeds
-from advsearch.config import PICTURE_SPP, PICTURES
+from advsearch.config import IMAGE_SUFFIXES, PICTURE_SPP
 from advsearch.controls import Control, Space, compose
-from advsearch.controls.base import sentences
+from advsearch.controls.base import describe_adjusted_defaults
 from advsearch.engine.loading import (
     Controls,
     Scene,
     Texture,
-    as_controls,
-    framed,
+    fit_camera,
     load_scene,
+    make_controls,
     make_renderer,
 )
 from advsearch.errors import InputError, UnknownNameError
@@ -33,20 +33,20 @@ from advsearch.report.figures import contact_sheet, marked
 from advsearch.report.wording import seen_text
 from advsearch.runs.files import png_bytes, write_exr, write_layers, write_png
 from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewPredictions
-from advsearch.scene.color import to_8_bit
+from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import SAMPLER, ImageFormation, Surfaces
-from advsearch.scene.outlines import seen_things
+from advsearch.scene.outlines import find_visible_meshes
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA
-from advsearch.scene.things import ALL
-from advsearch.settings import as_python
+from advsearch.scene.things import ALL_THINGS
+from advsearch.settings import to_python
 from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, Task, make_task
-from advsearch.tasks.together import each_thing
+from advsearch.tasks.together import make_each_thing_task
 from advsearch.trust.foreign_code import plainly
 from advsearch.trust.writing import placed_by
 
-MOST_PREDICTIONS = 5  # predictions of the model that a view has at most
+MAX_PREDICTIONS = 5  # predictions of the model that a view has at most
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,7 +66,7 @@ class View:
         output: of the model, for its task.
         truth: of the scene; None where the task does not depend on what is visible, or
             where it is unknown.
-        things: visible parts of the object and each thing beside it, see `things_seen`.
+        things: visible parts of the object and each thing beside it, see `find_visible_things`.
     """
 
     azimuth: float
@@ -117,7 +117,7 @@ class Rendering:
             InputError: another suffix, or an .exr of several views.
             StorageError: it could not be written.
         """
-        file = writable(path, len(self.views))
+        file = check_image_path(path, len(self.views))
         with placed_by("out"):
             if file.suffix.lower() == ".exr":
                 write_exr(file, self.views[0].linear)
@@ -145,8 +145,8 @@ class Rendering:
         with placed_by("out"):
             return write_layers(
                 Path(path).with_suffix(".aov.exr"),
-                surfaces.layers(aovs, OBJECT),
-                surfaces.notes(aovs),
+                surfaces.make_layers(aovs, OBJECT),
+                surfaces.describe_layers(aovs),
             )
 
     def sheet(self) -> Any:
@@ -214,7 +214,7 @@ class Rendering:
         out: Path,
         size: tuple[int, int],
         warnings: Sequence[str],
-        answered: Path | None = None,
+        prediction_path: Path | None = None,
     ) -> RenderResult:
         """Return everything but the images, as a result that can be stored.
 
@@ -222,13 +222,13 @@ class Rendering:
             out: file that was written.
             size: its height and width in pixels.
             warnings: all sentences for the user.
-            answered: file with the predictions drawn in, if there is one.
+            prediction_path: file with the predictions drawn in, if there is one.
         """
         scene = self.scene
         up = scene.object.up
         return RenderResult(
             out=str(out),
-            answered=None if answered is None else str(answered),
+            answered=None if prediction_path is None else str(prediction_path),
             size=size,
             object=scene.object_name,
             environment=scene.environment_name,
@@ -333,18 +333,18 @@ def render(
         scene = scene.with_texture(texture)
     description = scene.description
     unbound_task = make_task(task)
-    model = load_model(model, task=unbound_task.of_one_image)
+    model = load_model(model, task=unbound_task.single_image_task)
     model = replace(model, cameras=max(1, len(description.rig)))
-    check_judged(description, judge)
+    check_judged_thing(description, judge)
     model_task = unbound_task.on(model)
-    if judge == ALL:
-        model_task = each_thing(model_task)
-    instances = as_controls(controls)
+    if judge == ALL_THINGS:
+        model_task = make_each_thing_task(model_task)
+    instances = make_controls(controls)
     if around is not None:
         _check_azimuth_is_free(instances)
     settings = _ViewSettings(
         controls=instances,
-        size=as_python(resolution) or model.input_size,
+        size=to_python(resolution) or model.input_size,
         spp=spp,
         denoise=denoise,
         sampler=sampler,
@@ -359,7 +359,7 @@ def render(
     views = list[View]()
     truth_warnings = list[str]()
     remarks = tuple[str, ...]()
-    for view_description in _turned(description, around):
+    for view_description in _orbit_scene(description, around):
         rendered = _render_view(view_description, model, model_task, settings)
         views.append(rendered.view)
         model_task = rendered.task
@@ -372,8 +372,8 @@ def render(
     # Formation and space are the same for all views, exposure included.
     space = rendered.space
     warnings = (
-        *space.notes(description),
-        *sentences(space.moved),
+        *space.list_notes(description),
+        *describe_adjusted_defaults(space.adjusted_defaults),
         *truth_warnings,
         *remarks,
     )
@@ -392,7 +392,7 @@ def render(
 def _check_azimuth_is_free(controls: Sequence[Control]) -> None:
     """Raise InputError if a control sets the azimuth that `around` sets."""
     if any(
-        control.kind == "camera" and "azimuth" in control.settings()
+        control.kind == "camera" and "azimuth" in control.to_settings()
         for control in controls
     ):
         raise InputError(
@@ -405,7 +405,7 @@ def _render_view(
     description: SceneDescription, model: Model, task: Task, settings: _ViewSettings
 ) -> _RenderedView:
     """Render one view, and predict with the model what it shows."""
-    description = framed(description, settings.size)
+    description = fit_camera(description, settings.size)
     space = compose(settings.controls, description)
     renderer = make_renderer(
         description,
@@ -421,7 +421,7 @@ def _render_view(
         radiance = renderer.radiance(
             u, seeds.stream(settings.seed, "pictures"), settings.spp
         )
-        image = to_8_bit(space.picture(u, formation.display(radiance)))
+        image = round_to_8_bit(space.apply_to_image(u, formation.display(radiance)))
         output = model(image)
         truth = None
         truth_error = ""
@@ -432,7 +432,7 @@ def _render_view(
             except InputError as error:
                 truth_error = str(error)
         task = task.after_calibration(output, truth)
-        predictions = task.predictions(output, MOST_PREDICTIONS)[0]
+        predictions = task.predictions(output, MAX_PREDICTIONS)[0]
         marks = () if truth is None else tuple(task.marks(output, truth)[0])
     view = View(
         azimuth=description.number("camera.azimuth"),
@@ -443,7 +443,7 @@ def _render_view(
         surfaces=renderer.surfaces(u) if settings.with_surfaces else None,
         output=output,
         truth=truth,
-        things=things_seen(renderer, u),
+        things=find_visible_things(renderer, u),
     )
     return _RenderedView(view, task, space, formation, truth_error)
 
@@ -468,7 +468,7 @@ def _make_view_facts(
 ) -> Facts:
     """Return the facts of a configuration (d,), with a view for each camera of a rig."""
     facts, *camera_facts = [
-        facts_about(
+        make_facts(
             description,
             description.object_name,
             settings.label,
@@ -476,51 +476,54 @@ def _make_view_facts(
             look,
             settings.judge,
         )
-        for look in looks_at(renderer, u, len(description.rig))
+        for look in list_camera_renders(renderer, u, len(description.rig))
     ]
     return replace(facts, views=tuple(camera_facts))
 
 
-def check_judged(description: SceneDescription, judge: str) -> None:
+def check_judged_thing(description: SceneDescription, judge: str) -> None:
     """Check that a scene has the thing that is to be judged.
 
     Raises:
         UnknownNameError: nothing in the scene has that name.
         InputError: all things are to be judged, and there is only the object.
     """
-    if judge not in (OBJECT, ALL, *description.things):
+    if judge not in (OBJECT, ALL_THINGS, *description.things):
         raise UnknownNameError(
             "thing to judge:",
             judge,
-            (OBJECT, ALL, *description.things),
+            (OBJECT, ALL_THINGS, *description.things),
             "It stands in `judge`.",
         )
-    if judge == ALL and not description.things:
+    if judge == ALL_THINGS and not description.things:
         raise InputError(
             "judge: expected things beside the object for 'all', got none; add "
             "`things`, or leave `judge` out"
         )
 
 
-def looks_at(
-    renderer: Renderer, u: Tensor, cameras: int
+def list_camera_renders(
+    renderer: Renderer, u: Tensor, n_rig_cameras: int
 ) -> list[Callable[[], Surfaces]]:
     """Return functions that render what is visible at a configuration (d,).
 
-    The first renders the view of the camera; the others those of the `cameras` of a rig.
+    The first renders the view of the camera; the others those of the `n_rig_cameras` of a rig.
     """
     return [
         partial(renderer.surfaces, u),
-        *(partial(renderer.surfaces, u, camera=index) for index in range(cameras)),
+        *(
+            partial(renderer.surfaces, u, camera=index)
+            for index in range(n_rig_cameras)
+        ),
     ]
 
 
-def facts_about(
+def make_facts(
     description: SceneDescription,
     name: str,
     label: str | None,
-    values: Callable[[], Mapping[str, Value]],
-    look: Callable[[], Surfaces] | None = None,
+    describe: Callable[[], Mapping[str, Value]],
+    render_surfaces: Callable[[], Surfaces] | None = None,
     judge: str = OBJECT,
 ) -> Facts:
     """Return the facts of a scene by which a task judges predictions.
@@ -530,19 +533,19 @@ def facts_about(
         name: of its object.
         label: what is right, of the thing that is judged, or of the object where all
             are.
-        values: describes the configuration; other parameters have the values of the
+        describe: describes the configuration; other parameters have the values of the
             scene.
-        look: renders what the camera sees; it is called once at most.
-        judge: the thing that is judged: `OBJECT`, the name of one beside it, or `ALL`.
+        render_surfaces: renders what the camera sees; it is called once at most.
+        judge: the thing that is judged: `OBJECT`, the name of one beside it, or `ALL_THINGS`.
 
     Raises:
         UnknownNameError: no thing has the name `judge`.
     """
-    check_judged(description, judge)
-    cached_look = None if look is None else cache(look)
+    check_judged_thing(description, judge)
+    cached_look = None if render_surfaces is None else cache(render_surfaces)
 
     def collect_numbers() -> dict[str, float]:
-        configuration = {key: value["value"] for key, value in values().items()}
+        configuration = {key: value["value"] for key, value in describe().items()}
         all_values = {**description.values, **configuration}
         return {
             key: float(value)
@@ -562,7 +565,7 @@ def facts_about(
         own_label = description.things[mesh].label
         return Facts(mesh, thing_label, own_label, collect_numbers, sight)
 
-    labelled_mesh = OBJECT if judge == ALL else judge
+    labelled_mesh = OBJECT if judge == ALL_THINGS else judge
     single_facts = {
         mesh: make_thing_facts(mesh, label if mesh == labelled_mesh else None)
         for mesh in (OBJECT, *description.things)
@@ -573,32 +576,32 @@ def facts_about(
             other for other_mesh, other in single_facts.items() if other_mesh != mesh
         )
         facts_by_mesh[mesh] = replace(facts, others=others)
-    if judge == ALL:
+    if judge == ALL_THINGS:
         return replace(facts_by_mesh[OBJECT], each=facts_by_mesh)
     return facts_by_mesh[judge]
 
 
 def _look_at(look: Callable[[], Surfaces], mesh: str, *, metres: float | None) -> Sight:
     """Return what a task may know of one mesh, rendered when it is called."""
-    return sight_of(look(), mesh, metres)
+    return make_sight(look(), mesh, metres)
 
 
-def sight_of(
+def make_sight(
     surfaces: Surfaces, mesh: str = OBJECT, metres: float | None = None
 ) -> Sight:
     """Return what a task may know of what the camera sees: of one mesh, in metres.
 
     `metres` is the size of the object, where it is known.
     """
-    return Sight(surfaces.seen(mesh), surfaces.depth, surfaces.z_depth, metres)
+    return Sight(surfaces.visible_mask(mesh), surfaces.depth, surfaces.z_depth, metres)
 
 
-def things_seen(renderer: Renderer, u: Tensor) -> JsonObject | None:
+def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
     """Return what the image of a configuration (d,) shows of each thing, by name.
 
     None where nothing stands beside the object. See `runs.results.ThingSeen`.
     """
-    description = renderer.scene.made[0]
+    description = renderer.scene.definition[0]
     if not description.things:
         return None
     names = (OBJECT, *description.things)
@@ -614,19 +617,21 @@ def things_seen(renderer: Renderer, u: Tensor) -> JsonObject | None:
         }
         for name in names
     }
-    for thing in seen_things(renderer, u, names):
+    for thing in find_visible_meshes(renderer, u, names):
         things[thing.name] = {
             "label": labels[thing.name],
             "box": [*thing.box],
             "pixels": int(thing.mask.sum()),
-            "share": None if thing.share is None else round(thing.share, 4),
-            "truncated": thing.truncated,
+            "share": None
+            if thing.visible_fraction is None
+            else round(thing.visible_fraction, 4),
+            "truncated": thing.is_truncated,
             "distance": round(thing.distance, 3),
         }
     return things
 
 
-def writable(path: str | Path, views: int) -> Path:
+def check_image_path(path: str | Path, n_views: int) -> Path:
     """Return the path of an image if its name is one that can be written.
 
     Raises:
@@ -634,11 +639,11 @@ def writable(path: str | Path, views: int) -> Path:
     """
     file = Path(path)
     suffix = file.suffix.lower()
-    if suffix not in PICTURES:
+    if suffix not in IMAGE_SUFFIXES:
         raise InputError(
             f"out: expected the path of a .png or .exr file, got {str(path)!r}"
         )
-    if suffix == ".exr" and views > 1:
+    if suffix == ".exr" and n_views > 1:
         raise InputError(
             "out: a sheet of several views has text in it and is a .png; "
             "leave `around` out for an .exr"
@@ -648,7 +653,7 @@ def writable(path: str | Path, views: int) -> Path:
     return file
 
 
-def _turned(
+def _orbit_scene(
     description: SceneDescription, around: int | None
 ) -> Iterator[SceneDescription]:
     """Yield the scene from `around` azimuths, or once as it is where that is None."""

@@ -17,20 +17,28 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation, Policy
 from advsearch.attacks.evaluation import Query
-from advsearch.engine.acceptance import VIEWS, ComparedView, Deviation
-from advsearch.engine.bank import stratified
+from advsearch.engine.acceptance import N_VIEWS, ComparedView, Deviation
+from advsearch.engine.bank import sample_condition
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import PredictedSearch
 from advsearch.runs.results import BankOfConditions
-from advsearch.scene.color import to_8_bit
-from advsearch.scene.mitsuba_backend.surface import RAYS
+from advsearch.scene.color import round_to_8_bit
+from advsearch.scene.mitsuba_backend.surface import RAYS_PER_PIXEL
 from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.surface import renderer as surface_renderer
-from advsearch.scene.surface.arrangement import CAMERAS, COLOR, MAP
-from advsearch.scene.surface.renderer import Look, Sketch, SurfaceRenderer
-from advsearch.scene.transport.matrix import Tick
+from advsearch.scene.surface.arrangement import (
+    CAMERA_INPUTS,
+    COLOR_INPUT,
+    ENVIRONMENT_INPUT,
+)
+from advsearch.scene.surface.renderer import (
+    LitCameraView,
+    MapFingerprint,
+    SurfaceRenderer,
+)
+from advsearch.scene.transport.matrix import ProgressCallback
 
-WORTH = 32
+MIN_IMAGES = 32
 """Images of a search from which on the light pays.
 
 Light and a comparison take as long as some 25 rendered images, or 45 where the first
@@ -38,17 +46,17 @@ views do not decide.
 """
 # where light on surfaces has no advantage
 NO_CAMERA = Refusal("no camera moves", RefusalCause.NO_CAMERA)
-LIGHTS = 64  # environments in the bank, where they vary
-EVERY = 100  # evaluations from one comparison to the next, at first
-TOGETHER = 8  # images in a batch of the model
-AGAIN = 4
+N_LIGHTS = 64  # environments in the bank, where they vary
+COMPARISON_INTERVAL = 100  # evaluations from one comparison to the next, at first
+BATCH_SIZE = 8  # images in a batch of the model
+N_CONDITION_SETS = 4
 """Sets of conditions of a random search, which are used in turn.
 
 Nothing learns from its evaluations, and what each camera sees is stored.
 """
 
 
-def refusal_of_surface_light(
+def find_surface_light_refusal(
     problem: Problem, steps: int, policy: Policy[Any], specialise: bool
 ) -> Refusal | None:
     """Return why light on surfaces does not predict a search; None if it may.
@@ -57,14 +65,17 @@ def refusal_of_surface_light(
     """
     if not specialise:
         return Refusal("nothing is left out")
-    if problem.renderer.composed:
-        return Refusal(problem.renderer.composed)
+    if problem.renderer.composition_reason:
+        return Refusal(problem.renderer.composition_reason)
     names = [control.name for control in problem.space.controls]
-    if not surface_renderer.varied(problem.renderer, names) & CAMERAS:
+    if (
+        not surface_renderer.find_changed_inputs(problem.renderer, names)
+        & CAMERA_INPUTS
+    ):
         return NO_CAMERA
-    if steps * problem.draws < WORTH:
+    if steps * problem.n_draws < MIN_IMAGES:
         return Refusal(
-            f"light on surfaces pays from {WORTH} pictures on",
+            f"light on surfaces pays from {MIN_IMAGES} pictures on",
             RefusalCause.TOO_FEW_STEPS,
         )
     if policy.takes_differences(problem.domain, steps):
@@ -72,7 +83,7 @@ def refusal_of_surface_light(
     for group in problem.plan.groups:
         if group.is_forced and group.estimator not in ("none", "image"):
             return Refusal(f"the estimator of {group.name} is forced")
-    return surface_renderer.why_not(problem.renderer, names)
+    return surface_renderer.find_refusal(problem.renderer, names)
 
 
 @dataclass
@@ -80,21 +91,21 @@ class SurfaceLight(PredictedSearch):
     """The light on surfaces of a run whose searches have many cameras.
 
     Attributes:
-        at: (d,) configuration whose light is computed; None for the start.
-        places: indices of the coordinates of u that move; None for those of cameras and
+        light_u: (d,) configuration whose light is computed; None for the start.
+        moving_coordinates: indices of the coordinates of u that move; None for those of cameras and
             environments.
     """
 
-    way: ClassVar[str] = "surface light"
-    at: Tensor | None = None
-    places: Tensor | None = None
+    method: ClassVar[str] = "surface light"
+    light_u: Tensor | None = None
+    moving_coordinates: Tensor | None = None
     _renderer: SurfaceRenderer | None = None
     # coordinates of the conditions of the bank
     _bank_conditions: list[Tensor] = field(default_factory=list)
     _n_lights: int = 0
     _next_comparison: int = 0
     # what cameras see, by index of the conditions and begin of the batch
-    _looks: dict[tuple[int, int], list[Look]] = field(default_factory=dict)
+    _looks: dict[tuple[int, int], list[LitCameraView]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Find which coordinates move cameras, change environments and color surfaces."""
@@ -102,23 +113,27 @@ class SurfaceLight(PredictedSearch):
         space = problem.space
         n_searched = problem.domain.dim
         self._inputs_of_control = {
-            control.name: surface_renderer.varied(problem.renderer, [control.name])
+            control.name: surface_renderer.find_changed_inputs(
+                problem.renderer, [control.name]
+            )
             for control in space.controls
         }
-        self._moving = self._find_coordinates(CAMERAS | {MAP})[:n_searched]
-        if self.places is not None:
+        self._moving = self._find_coordinates(CAMERA_INPUTS | {ENVIRONMENT_INPUT})[
+            :n_searched
+        ]
+        if self.moving_coordinates is not None:
             self._moving = torch.zeros(n_searched, dtype=torch.bool).index_fill_(
-                0, self.places, True
+                0, self.moving_coordinates, True
             )
         self._has_moving = bool(self._moving.any())
-        is_coloring = self._find_coordinates(frozenset({COLOR}))[:n_searched]
+        is_coloring = self._find_coordinates(frozenset({COLOR_INPUT}))[:n_searched]
         self._searches_colors = bool(is_coloring.any())
-        self.drawn = problem.conditions is not None and self._searches_colors
+        self.draws_conditions = problem.conditions is not None and self._searches_colors
         # The base color is an input of its own: where the searched controls set nothing
         # else, the inputs of the conditions are enough.
         self._input_space = space
         if not self._has_moving:
-            conditions = space.controls[problem.searched or 0 :]
+            conditions = space.controls[problem.n_searched or 0 :]
             self._input_space = replace(space, controls=conditions)
         self._needs_new_light = self._find_light_conditions()[n_searched:]
 
@@ -138,69 +153,77 @@ class SurfaceLight(PredictedSearch):
         An environment that only becomes brighter needs none.
         """
         problem = self.problem
-        needs_new_light = self._find_coordinates(frozenset({MAP}))
+        needs_new_light = self._find_coordinates(frozenset({ENVIRONMENT_INPUT}))
         if problem.conditions is None:
             return needs_new_light
-        start = problem.whole(problem.domain.start)
+        start = problem.add_conditions(problem.domain.start)
         for group in problem.space.groups:
             if bool(needs_new_light[group.coordinates].all()):
                 lower = start.clone()
                 lower[group.coordinates] = 0.3
                 upper = start.clone()
                 upper[group.coordinates] = 0.8
-                darker = Sketch.of(self._compute_inputs(lower)[MAP])
-                brighter = Sketch.of(self._compute_inputs(upper)[MAP])
-                needs_new_light[group.coordinates] = darker.times(brighter) is None
+                darker = MapFingerprint.compute(
+                    self._compute_inputs(lower)[ENVIRONMENT_INPUT]
+                )
+                brighter = MapFingerprint.compute(
+                    self._compute_inputs(upper)[ENVIRONMENT_INPUT]
+                )
+                needs_new_light[group.coordinates] = (
+                    darker.find_factor(brighter) is None
+                )
         return needs_new_light
 
     @property
-    def samples(self) -> int:
-        return LIGHTS
+    def n_samples(self) -> int:
+        return N_LIGHTS
 
-    def conditions(self) -> BankOfConditions | None:
+    def summarize_conditions(self) -> BankOfConditions | None:
         if self.problem.conditions is None:
             return None
         return BankOfConditions(
-            made=self._n_lights, dropped=self.renderer.dropped, grown=0, gap=None
+            made=self._n_lights, dropped=self.renderer.n_dropped, grown=0, gap=None
         )
 
-    def size(self) -> tuple[int, int]:
-        return self.renderer.entries, self.renderer.bytes
+    def measure_size(self) -> tuple[int, int]:
+        return self.renderer.n_entries, self.renderer.n_bytes
 
     @property
-    def too_far_off(self) -> Refusal | None:
-        if not self.deviations or self.deviations[0].good:
+    def accuracy_refusal(self) -> Refusal | None:
+        if not self.deviations or self.deviations[0].is_accepted:
             return None
         return Refusal(f"light on surfaces is {self.deviations[0].reason}")
 
-    def predicted(self, kind: str, evaluations: int) -> int:
-        if "search" in self.ends and kind != "search":
+    def count_predicted(self, kind: str, evaluations: int) -> int:
+        if "search" in self.first_traced and kind != "search":
             # another search is later, and is traced from its first evaluation on
             return 0
-        return super().predicted(kind, evaluations)
+        return super().count_predicted(kind, evaluations)
 
-    def prepare(self, tick: Tick = lambda samples: None) -> None:
+    def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
         """Compute the light under every condition of the bank, and compare its images."""
         problem = self.problem
-        u = problem.domain.start if self.at is None else self.at
-        with self.timed(), torch.no_grad():
-            full_u = problem.whole(u)
+        u = problem.domain.start if self.light_u is None else self.light_u
+        with self.count_time(), torch.no_grad():
+            full_u = problem.add_conditions(u)
             self._renderer = SurfaceRenderer(
                 problem.renderer, full_u, seeds.stream(problem.seed, "surface light")
             )
             self._bank_conditions = [full_u[problem.domain.dim :]]
             if problem.conditions is not None:
                 seed = seeds.stream(problem.seed, "bank")
-                n_conditions = LIGHTS if bool(self._needs_new_light.any()) else 1
+                n_conditions = N_LIGHTS if bool(self._needs_new_light.any()) else 1
                 self._bank_conditions = [
-                    stratified(problem.conditions, index, seed)
+                    sample_condition(problem.conditions, index, seed)
                     for index in range(n_conditions)
                 ]
             for condition in self._bank_conditions:
                 inputs = self._compute_inputs(torch.cat([u, condition]))
-                self._renderer.kept_light(inputs)
-                tick(LIGHTS // len(self._bank_conditions))
-            self._n_lights = len(self._renderer.lights_kept) + self._renderer.dropped
+                self._renderer.get_light(inputs)
+                tick(N_LIGHTS // len(self._bank_conditions))
+            self._n_lights = (
+                len(self._renderer.stored_lights) + self._renderer.n_dropped
+            )
         self._compare(u, 0)
 
     @property
@@ -212,23 +235,23 @@ class SurfaceLight(PredictedSearch):
         return self._renderer
 
     def evaluate_all(
-        self, queries: Sequence[Query], traced: Evaluate
+        self, queries: Sequence[Query], trace: Evaluate
     ) -> Iterator[Evaluation]:
         """Evaluate queries of a search, or trials, in their order.
 
-        `traced` evaluates all queries from the first that is not predicted.
+        `trace` evaluates all queries from the first that is not predicted.
         """
         # images of queries that were predicted in one batch, by position
         predicted_images: dict[int, Tensor] = {}
         for position, query in enumerate(queries):
-            self.passed(query)
+            self.replay(query)
             if self._must_trace(query):
-                yield from traced(queries[position:])
+                yield from trace(queries[position:])
                 return
             can_batch = self.problem.conditions is None and not self._searches_colors
             if can_batch and position not in predicted_images:
-                batch = queries[position : position + self.renderer.at_once]
-                images = self.renderer.pictures([batched.u for batched in batch])
+                batch = queries[position : position + self.renderer.batch_size]
+                images = self.renderer.predict_images([batched.u for batched in batch])
                 predicted_images = dict(enumerate(images, position))
             yield self.evaluate(query, predicted_images.get(position))
 
@@ -237,39 +260,39 @@ class SurfaceLight(PredictedSearch):
         costs_renders = self.problem.domain.gradient_cost > 0
         if query.gradient is True and costs_renders:
             return True
-        return self.predicted(query.kind, query.number + 1) <= query.number
+        return self.count_predicted(query.kind, query.number + 1) <= query.number
 
-    def evaluate(self, query: Query, picture: Tensor | None = None) -> Evaluation:
+    def evaluate(self, query: Query, image: Tensor | None = None) -> Evaluation:
         """Evaluate a query, with its image (H, W, 3) if that is predicted already."""
         if query.phase is None:
-            return self._evaluate_trial(query, picture)
-        if picture is not None:
-            return self._evaluate_image(query, picture)
+            return self._evaluate_trial(query, image)
+        if image is not None:
+            return self._evaluate_image(query, image)
         return self._evaluate_over_conditions(query)
 
     def _evaluate_trial(self, query: Query, image: Tensor | None) -> Evaluation:
         """Evaluate a trial: judge the predicted image as a file would hold it."""
-        full_u = self.problem.whole(query.u)
+        full_u = self.problem.add_conditions(query.u)
         with torch.no_grad():
-            rounded = to_8_bit(self.renderer(full_u) if image is None else image)
-        return Evaluation.of(
+            rounded = round_to_8_bit(self.renderer(full_u) if image is None else image)
+        return Evaluation.from_judgement(
             self.problem.judge(rounded, full_u),
             cost=0,
-            predicted=RAYS,
-            picture=rounded if query.keep else None,
+            predicted=RAYS_PER_PIXEL,
+            picture=rounded if query.with_image else None,
         )
 
     def _evaluate_image(self, query: Query, image: Tensor) -> Evaluation:
         """Evaluate a query of a search by its predicted image, without derivative."""
-        evaluated, _ = self.problem.judged(
+        evaluated, _ = self.problem.evaluate_batch(
             lambda u: image[None], [query.u], query.u, False
         )
         ((evaluation, _),) = evaluated
         return replace(
             evaluation,
             cost=query.samples,
-            predicted=RAYS,
-            picture=to_8_bit(image) if query.keep else None,
+            predicted=RAYS_PER_PIXEL,
+            picture=round_to_8_bit(image) if query.with_image else None,
         )
 
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
@@ -281,8 +304,8 @@ class SurfaceLight(PredictedSearch):
             and problem.conditions is not None
             and not self._has_moving
         )
-        index = query.number % AGAIN if reuses_conditions else query.number
-        conditions = self._choose_conditions(query.kind, index, problem.draws)
+        index = query.number % N_CONDITION_SETS if reuses_conditions else query.number
+        conditions = self._choose_conditions(query.kind, index, problem.n_draws)
         full_configurations = [
             torch.cat([query.u, condition]) for condition in conditions
         ]
@@ -291,15 +314,15 @@ class SurfaceLight(PredictedSearch):
             key = (index, batch.start) if reuses_conditions else None
             return self._predict_images(full_configurations[batch], u, key)
 
-        evaluation = problem.mean_under(
-            predict, full_configurations, query.u, query.gradient, TOGETHER
+        evaluation = problem.evaluate_conditions(
+            predict, full_configurations, query.u, query.gradient, BATCH_SIZE
         )
-        evaluation = replace(evaluation, cost=query.samples, predicted=RAYS)
-        if not query.keep:
+        evaluation = replace(evaluation, cost=query.samples, predicted=RAYS_PER_PIXEL)
+        if not query.with_image:
             return evaluation
         with torch.no_grad():
-            images = self._predict_images([problem.whole(query.u)], query.u)
-            return replace(evaluation, picture=to_8_bit(images[0]))
+            images = self._predict_images([problem.add_conditions(query.u)], query.u)
+            return replace(evaluation, picture=round_to_8_bit(images[0]))
 
     def _choose_conditions(self, kind: str, number: int, count: int) -> list[Tensor]:
         """Return conditions of an evaluation: new cameras under lights of the bank."""
@@ -337,44 +360,46 @@ class SurfaceLight(PredictedSearch):
 
         What cameras see is stored under `key`, if there is one, for later calls.
         """
-        color = self.renderer.color(self.problem.searched_space.inputs(u))
+        color = self.renderer.get_color(self.problem.searched_space.inputs(u))
         variable_configurations = [
             torch.cat([u, full_u[len(u) :]]) for full_u in full_configurations
         ]
         inputs = [self._compute_inputs(full_u) for full_u in full_configurations]
-        looks: Iterable[Look]
+        looks: Iterable[LitCameraView]
         if key is None:
-            looks = self.renderer.looks(inputs)
+            looks = self.renderer.trace_views(inputs)
         else:
             if key not in self._looks:
-                self._looks[key] = list(self.renderer.looks(inputs))
+                self._looks[key] = list(self.renderer.trace_views(inputs))
             looks = self._looks[key]
-        return self.renderer.shown(looks, inputs, color, variable_configurations)
+        return self.renderer.compose_images(
+            looks, inputs, color, variable_configurations
+        )
 
-    def passed(self, query: Query) -> None:
+    def replay(self, query: Query) -> None:
         """Compare predictions where that is due.
 
-        That is every `EVERY` evaluations where base colors are searched, as their light
+        That is every `COMPARISON_INTERVAL` evaluations where base colors are searched, as their light
         gets old; else after twice as many each time, until predictions are too far off.
         """
-        if query.kind != "search" or query.phase != "search" or self.given_up:
+        if query.kind != "search" or query.phase != "search" or self.tracing_reason:
             return
-        if query.number < (self._next_comparison or EVERY):
+        if query.number < (self._next_comparison or COMPARISON_INTERVAL):
             return
-        was_accurate = self.deviations[-1].good
-        is_accurate = self._compare(query.u, query.number).good
-        interval = EVERY
+        was_accurate = self.deviations[-1].is_accepted
+        is_accurate = self._compare(query.u, query.number).is_accepted
+        interval = COMPARISON_INTERVAL
         if is_accurate and not self._searches_colors:
             interval = query.number
         self._next_comparison = query.number + interval
         if is_accurate:
             return
         if not was_accurate:
-            self.give_up("search", query.number)
+            self.trace_from("search", query.number)
         elif self._searches_colors:
-            with self.timed():
-                self.renderer.renew(self.problem.whole(query.u))
-            self.renewed = (self.renewed or 0) + 1
+            with self.count_time():
+                self.renderer.update_base_color(self.problem.add_conditions(query.u))
+            self.n_renewals = (self.n_renewals or 0) + 1
 
     def _compare(self, u: Tensor, index: int) -> Deviation:
         """Compare predicted images with traced ones, and store the deviation.
@@ -385,12 +410,12 @@ class SurfaceLight(PredictedSearch):
         problem = self.problem
         kind = "surface check"
         seed = seeds.stream(problem.seed, kind, index)
-        with self.timed():
+        with self.count_time():
             generator = torch.Generator().manual_seed(seed)
-            samples = problem.domain.sample(generator, VIEWS)
+            samples = problem.domain.sample(generator, N_VIEWS)
             configurations = torch.where(self._moving, samples, u)
             configurations[0] = u
-            conditions = self._choose_conditions(kind, index, VIEWS)
+            conditions = self._choose_conditions(kind, index, N_VIEWS)
             full_configurations = [
                 torch.cat([view_u, condition])
                 for view_u, condition in zip(configurations, conditions, strict=True)
@@ -400,12 +425,12 @@ class SurfaceLight(PredictedSearch):
                 is_random = torch.ones_like(self._moving)
 
         def compare_view(number: int) -> ComparedView:
-            return problem.view(
+            return problem.compare_view(
                 self.renderer,
                 full_configurations[number],
                 seeds.stream(seed, "view", number),
                 problem.spp,
-                drawn=is_random,
+                is_random=is_random,
             )
 
         return self.compare(compare_view)

@@ -25,42 +25,42 @@ from advsearch.attacks import (
     run_trials,
     verify,
 )
-from advsearch.attacks.domain import batches
-from advsearch.attacks.evaluation import Query, most_at_once
+from advsearch.attacks.domain import split_into_batches
+from advsearch.attacks.evaluation import Query, max_batch_size
 from advsearch.attacks.trials import (
-    CONDITIONS,
     LADDER,
+    N_CONDITIONS,
     OVER_LADDER,
     SampleCount,
-    affordable,
     choose_rate_spp,
-    margins_of,
+    limit_ladder,
+    make_margin_function,
     most_samples,
 )
 from advsearch.cluster import Workers
-from advsearch.engine.journal import Journal, Shared
+from advsearch.engine.journal import Journal, ParallelEvaluator
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import KEPT, Findings
+from advsearch.engine.record import MAX_STORED_IMAGES, RunState
 from advsearch.engine.transport import PredictedSearch
 from advsearch.errors import InputError
 from advsearch.progress import Progress, Stages
 from advsearch.report.wording import count as plural
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_configuration
-from advsearch.scene.color import to_8_bit
-from advsearch.scene.formation import next_count
+from advsearch.scene.color import round_to_8_bit
+from advsearch.scene.formation import round_sample_count
 from advsearch.tasks import Judgement
 
 # coordinates of a configuration up to which the row of a trial has its values
-MANY = 64
+MAX_DESCRIBED_COORDINATES = 64
 
 
-def ladder_of(verify_spp: int | None, sampler: str) -> Sequence[int]:
+def choose_ladder(verify_spp: int | None, sampler: str) -> Sequence[int]:
     """Return the samples per pixel that a verification may choose from, ascending.
 
     It is a single count if `verify_spp` states one, rounded as the sampler needs it.
     """
-    return LADDER if verify_spp is None else (next_count(sampler, verify_spp),)
+    return LADDER if verify_spp is None else (round_sample_count(sampler, verify_spp),)
 
 
 @dataclass
@@ -74,18 +74,18 @@ class Verifier:
         journal: evaluates and stores the trials.
         ladder: sample counts to choose from, ascending; a single one is not tested.
         stages: of the progress of the run.
-        findings: results, images and the count of renders.
+        state: results, images and the count of renders.
         looks: numbers of trials, ascending, after which the verdict of a group may
             stand; the last is the size of a group.
-        sought: whether rows have a success: whether a prediction is sought.
+        has_success: whether rows have a success: whether a prediction is sought.
     """
 
     journal: Journal
     ladder: Sequence[int]
     stages: Stages
-    findings: Findings = field(default_factory=Findings)
+    state: RunState = field(default_factory=RunState)
     looks: tuple[int, ...] = (0,)
-    sought: bool = True
+    has_success: bool = True
     _clean_spp: int = 0
     _clean_kind: str = "control"
     # kind and number of all trials that were rendered
@@ -96,13 +96,13 @@ class Verifier:
         cls, run: RunDirectory, problem: Problem, ladder: Sequence[int], stages: Stages
     ) -> Verifier:
         """Return a verifier that renders in this process and stores in a run directory."""
-        return cls(Journal(run, Shared(problem)), ladder, stages)
+        return cls(Journal(run, ParallelEvaluator(problem)), ladder, stages)
 
     def __post_init__(self) -> None:
         self.problem: Problem = self.journal.problem
 
     @property
-    def count(self) -> int:
+    def n_trials(self) -> int:
         """Trials of a group."""
         return self.looks[-1]
 
@@ -124,25 +124,25 @@ class Verifier:
         """
         evaluate = None
         if predictor is not None:
-            evaluate = partial(predictor.evaluate_all, traced=self.journal.traced)
-        if not self.sought:
-            queries = [replace(query, sought=False) for query in queries]
+            evaluate = partial(predictor.evaluate_all, trace=self.journal.evaluator)
+        if not self.has_success:
+            queries = [replace(query, has_success=False) for query in queries]
         evaluations = self.journal.evaluate_all(queries, evaluate)
         for query, evaluation in zip(queries, evaluations, strict=True):
             trial = (query.kind, query.number)
             if evaluation.picture is not None:
-                self.findings.pictures[trial] = evaluation.picture
+                self.state.trial_images[trial] = evaluation.picture
             if evaluation.predicted:
-                self.findings.predicted_trials += 1
+                self.state.n_predicted_trials += 1
             else:
                 self._rendered.add(trial)
-            self.findings.verification_renders = len(self._rendered)
+            self.state.verification_renders = len(self._rendered)
             steps = query.spp if in_samples else 1
-            self.stages.progress.advance(steps, **self.journal.traced.told)
+            self.stages.progress.advance(steps, **self.journal.evaluator.progress_stats)
             yield evaluation
 
     def choose_spp(
-        self, candidates: dict[str, Tensor], searched: int | None = None
+        self, candidates: dict[str, Tensor], search_samples: int | None = None
     ) -> None:
         """Choose the sample count of the verification, and store it in the findings.
 
@@ -152,7 +152,7 @@ class Verifier:
 
         Args:
             candidates: configurations (d,) by name.
-            searched: samples that the searches took, which bound those of this choice
+            search_samples: samples that the searches took, which bound those of this choice
                 where conditions vary.
         """
         varies = self.problem.conditions is not None
@@ -162,8 +162,8 @@ class Verifier:
         if varies:
             choose: Callable[..., SampleCount] = choose_rate_spp
             if has_choice:
-                ladder = self._condition_ladder(len(candidates), searched)
-            max_samples = CONDITIONS * len(candidates) * sum(ladder)
+                ladder = self._condition_ladder(len(candidates), search_samples)
+            max_samples = N_CONDITIONS * len(candidates) * sum(ladder)
         else:
             choose = partial(choose_spp, trials=n_trials)
             max_samples = most_samples(len(candidates), ladder, n_trials)
@@ -179,14 +179,16 @@ class Verifier:
             )
         evaluate = partial(self.evaluate_all, in_samples=True)
         margins = {
-            name: margins_of(
-                evaluate, f"sample count {name}", u, keep=KEPT, drawn=varies
+            name: make_margin_function(
+                evaluate,
+                f"sample count {name}",
+                u,
+                n_images=MAX_STORED_IMAGES,
+                draws_conditions=varies,
             )
             for name, u in candidates.items()
         }
-        self.findings.sample_count = choose(
-            margins, seed=self.problem.seed, ladder=ladder
-        )
+        self.state.sample_count = choose(margins, seed=self.problem.seed, ladder=ladder)
 
     def _condition_ladder(
         self, n_candidates: int, searched: int | None
@@ -194,8 +196,8 @@ class Verifier:
         """Return the sample counts to choose from where conditions vary."""
         if searched is None:
             return OVER_LADDER
-        n_trials = (n_candidates + 1) * self.count
-        return affordable(OVER_LADDER, n_trials, searched)
+        n_trials = (n_candidates + 1) * self.n_trials
+        return limit_ladder(OVER_LADDER, n_trials, searched)
 
     def try_clean(self) -> None:
         """Run the trials of the control group, unless they were run at this count.
@@ -204,33 +206,33 @@ class Verifier:
         start that looked wrong at first is tried before the search, at a sample count of
         its own, and then again.
         """
-        if self.clean_tried:
+        if self.has_clean_trials:
             return
-        self._clean_spp = self.findings.spp
-        is_before_search = self.findings.search is None
+        self._clean_spp = self.state.spp
+        is_before_search = self.state.search is None
         self._clean_kind = "first control" if is_before_search else "control"
-        self.findings.clean = run_trials(
+        self.state.clean_trials = run_trials(
             self.evaluate_all,
             self.problem.domain.start,
             spp=self._clean_spp,
             seed=self.problem.seed,
             trials=self.looks[0],
             kind=self._clean_kind,
-            keep=KEPT,
+            n_images=MAX_STORED_IMAGES,
         )
 
     @property
-    def clean_tried(self) -> bool:
+    def has_clean_trials(self) -> bool:
         """Whether the control group was tried at the present sample count."""
-        return bool(self.findings.clean) and self._clean_spp == self.findings.spp
+        return bool(self.state.clean_trials) and self._clean_spp == self.state.spp
 
-    def verified(
+    def verify(
         self,
         kind: str,
-        found: SearchResult,
+        result: SearchResult,
         *,
         curtailed: bool = False,
-        again: bool = False,
+        with_new_trials: bool = False,
     ) -> Verification:
         """Verify the configuration that a search found against the control group.
 
@@ -238,36 +240,36 @@ class Verifier:
 
         Args:
             kind: of the rows.
-            found: result of the search.
+            result: result of the search.
             curtailed: whether only the verdict matters, and not the rate.
-            again: whether both groups get new trials, numbered after all others.
+            with_new_trials: whether both groups get new trials, numbered after all others.
         """
         verification = verify(
             self.evaluate_all,
             self.problem.domain,
-            found.best_u,
-            claim=found.ending,
-            spp=self.findings.spp,
+            result.best_u,
+            claim=result.ending,
+            spp=self.state.spp,
             seed=self.problem.seed,
             trials=self.looks,
-            clean=() if again else self.findings.clean,
+            clean=() if with_new_trials else self.state.clean_trials,
             rule=self.problem.rule,
             kind=kind,
-            control=self._clean_kind,
-            keep=KEPT,
+            control_kind=self._clean_kind,
+            n_images=MAX_STORED_IMAGES,
             curtailed=curtailed,
-            begin=self.count if again else 0,
+            first_index=self.n_trials if with_new_trials else 0,
         )
-        if not again:
-            self.findings.clean = verification.clean_trials
+        if not with_new_trials:
+            self.state.clean_trials = verification.clean_trials
         return verification
 
-    def trials(
+    def try_configurations(
         self,
         kind: str,
         configurations: Mapping[int, Tensor],
         *,
-        sought: bool = True,
+        has_success: bool = True,
         predictor: PredictedSearch | None = None,
     ) -> Iterator[Judgement]:
         """Try configurations (d,) once each, every one with a seed of its own.
@@ -275,51 +277,57 @@ class Verifier:
         Args:
             kind: of the rows.
             configurations: by their numbers among those of the kind.
-            sought: whether rows have a success.
+            has_success: whether rows have a success.
             predictor: as for `evaluate_all`.
         """
         problem = self.problem
         queries = list[Query]()
         for number, u in configurations.items():
             seed = seeds.stream(problem.seed, kind, number)
-            values = problem.describe(u, seed) if problem.domain.dim <= MANY else {}
+            values = (
+                problem.describe(u, seed)
+                if problem.domain.dim <= MAX_DESCRIBED_COORDINATES
+                else {}
+            )
             query = Query(
                 u,
                 seed,
                 kind,
                 number,
-                spp=self.findings.spp,
+                spp=self.state.spp,
                 values=values,
-                sought=sought,
+                has_success=has_success,
             )
             queries.append(query)
         for evaluation in self.evaluate_all(queries, predictor=predictor):
-            yield evaluation.said
+            yield evaluation.required_judgement
 
-    def trials_of(
+    def try_in_batches(
         self,
         kind: str,
         count: int,
         find_configuration: Callable[[int], Tensor],
         *,
-        sought: bool = True,
+        has_success: bool = True,
         predictor: PredictedSearch | None = None,
     ) -> Iterator[Judgement]:
         """Try configurations of a kind, numbered from 0, in batches that fit into memory.
 
         `find_configuration` returns the configuration (d,) of a number; see `trials`.
         """
-        for numbers in batches(0, count, most_at_once(self.problem.domain.dim)):
+        for numbers in split_into_batches(
+            0, count, max_batch_size(self.problem.domain.dim)
+        ):
             configurations = {number: find_configuration(number) for number in numbers}
-            yield from self.trials(
-                kind, configurations, sought=sought, predictor=predictor
+            yield from self.try_configurations(
+                kind, configurations, has_success=has_success, predictor=predictor
             )
 
-    def average(self, count: int) -> None:
+    def try_random(self, n_trials: int) -> None:
         """Try random configurations: how often is the model wrong on average?"""
         problem = self.problem
-        self.begin(
-            "trying random configurations", count, name="average", flags="`average`"
+        self.begin_stage(
+            "trying random configurations", n_trials, name="average", flags="`average`"
         )
 
         def sample_configuration(number: int) -> Tensor:
@@ -328,13 +336,13 @@ class Verifier:
             )
             return problem.domain.sample(generator)[0]
 
-        trials = self.trials_of("average", count, sample_configuration)
-        self.findings.average = tuple(trials)
+        trials = self.try_in_batches("average", n_trials, sample_configuration)
+        self.state.random_trials = tuple(trials)
 
-    def begin(
+    def begin_stage(
         self,
         title: str,
-        trials: int,
+        n_trials: int,
         *,
         name: str = "verification",
         flags: str = "`trials` or `verify_spp`",
@@ -344,15 +352,15 @@ class Verifier:
 
         Args:
             title: for the progress bar.
-            trials: how many there will be.
+            n_trials: how many there will be.
             name: of the stage.
             flags: settings that shorten it, for the hint.
             at_most: whether there may be fewer.
         """
         bound = "at most " if at_most else ""
-        samples = plural(self.findings.spp, "sample")
-        hint = f"{bound}{trials} pictures of {samples} a pixel; {flags} shorten it"
-        self.stages.begin(name, title, trials, hint=hint, at_most=at_most)
+        samples = plural(self.state.spp, "sample")
+        hint = f"{bound}{n_trials} pictures of {samples} a pixel; {flags} shorten it"
+        self.stages.begin(name, title, n_trials, hint=hint, at_most=at_most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,11 +371,11 @@ class RetrialCondition:
         name: of the condition.
         problem: judges its images.
         spp: samples per pixel.
-        source: conditions of equal source share the rendered image of a trial, (H, W,
+        image_key: conditions of equal source share the rendered image of a trial, (H, W,
             3) sRGB in [0, 1].
-        change: from the rendered image and the seed of the trial to the model's image;
+        change_image: from the rendered image and the seed of the trial to the model's image;
             None for the image itself.
-        light: conditions of equal light share the linear radiance of a trial, as their
+        radiance_key: conditions of equal light share the linear radiance of a trial, as their
             scenes are equal and only tone curves or models differ; None for a
             condition that renders by itself.
     """
@@ -375,9 +383,9 @@ class RetrialCondition:
     name: str
     problem: Problem
     spp: int
-    source: Hashable
-    change: Callable[[Tensor, int], Tensor] | None = None
-    light: Hashable = None
+    image_key: Hashable
+    change_image: Callable[[Tensor, int], Tensor] | None = None
+    radiance_key: Hashable = None
 
 
 class Retrials:
@@ -409,11 +417,13 @@ class Retrials:
         self._progress = progress
         self._n_trials = trials
         self._seed = seed
-        first_journal = Journal(run, Shared(conditions[0].problem))
+        first_journal = Journal(run, ParallelEvaluator(conditions[0].problem))
         self._journals = {
             condition.name: replace(
                 first_journal,
-                traced=Shared(condition.problem, executor, condition.name),
+                evaluator=ParallelEvaluator(
+                    condition.problem, executor, condition.name
+                ),
             )
             for condition in conditions
         }
@@ -424,10 +434,12 @@ class Retrials:
         self._shared_kind = ""
         # how many conditions have each light
         self._n_conditions_of_light = Counter(
-            condition.light for condition in conditions if condition.light is not None
+            condition.radiance_key
+            for condition in conditions
+            if condition.radiance_key is not None
         )
 
-    def clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
+    def try_clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
         """Return the trials of the clean scene under a condition."""
         if condition.name not in self._clean:
             self._clean[condition.name] = run_trials(
@@ -440,7 +452,7 @@ class Retrials:
             )
         return self._clean[condition.name]
 
-    def adversarial(
+    def try_adversarial(
         self, kind: str, u: Tensor, condition: RetrialCondition
     ) -> Verification:
         """Try a configuration (d,) under one condition, compared with the clean scene.
@@ -456,7 +468,7 @@ class Retrials:
             spp=condition.spp,
             seed=self._seed,
             trials=self._n_trials,
-            clean=self.clean(condition),
+            clean=self.try_clean(condition),
             rule=condition.problem.rule,
             kind=f"{kind} under {condition.name}",
         )
@@ -483,13 +495,13 @@ class Retrials:
             self._radiances.clear()
             self._shared_kind = kind
         problem = condition.problem
-        keys = [(condition.source, query.seed, condition.spp) for query in queries]
+        keys = [(condition.image_key, query.seed, condition.spp) for query in queries]
         missing = [
-            replace(query, wanted="picture")
+            replace(query, product="picture")
             for query, key in zip(queries, keys, strict=True)
             if key not in self._images
         ]
-        evaluator = self._journals[condition.name].traced
+        evaluator = self._journals[condition.name].evaluator
         has_workers = evaluator.executor is not None and len(missing) > 1
         from_workers = iter(evaluator(missing) if has_workers else ())
         for query, key in zip(queries, keys, strict=True):
@@ -503,11 +515,11 @@ class Retrials:
                     machine = rendered.machine
                 self._images[key] = image
             image = self._images[key]
-            if condition.change is not None:
-                image = condition.change(image, query.seed)
-            full_u = problem.whole(query.u, query.seed)
-            judgement = problem.judge(to_8_bit(image), full_u)
-            yield Evaluation.of(judgement, machine=machine)
+            if condition.change_image is not None:
+                image = condition.change_image(image, query.seed)
+            full_u = problem.add_conditions(query.u, query.seed)
+            judgement = problem.judge(round_to_8_bit(image), full_u)
+            yield Evaluation.from_judgement(judgement, machine=machine)
 
     def _render(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
         """Return the image (H, W, 3) of u (d,), as `Problem.picture` does.
@@ -516,28 +528,28 @@ class Retrials:
         there are any.
         """
         problem = condition.problem
-        if self._n_conditions_of_light[condition.light] < 2:
+        if self._n_conditions_of_light[condition.radiance_key] < 2:
             return problem.picture(u, seed, condition.spp)
         renderer = problem.renderer
-        full_u = problem.whole(u, seed)
-        key = (condition.light, seed, condition.spp)
+        full_u = problem.add_conditions(u, seed)
+        key = (condition.radiance_key, seed, condition.spp)
         with torch.no_grad():
             if key not in self._radiances:
                 self._radiances[key] = renderer.radiance(full_u, seed, condition.spp)
             displayed = renderer.formation.display(self._radiances[key])
-            return to_8_bit(renderer.space.picture(full_u, displayed))
+            return round_to_8_bit(renderer.space.picture(full_u, displayed))
 
 
-def kept_configuration(folder: Path, problem: Problem) -> torch.Tensor:
+def read_stored_configuration(directory: Path, problem: Problem) -> torch.Tensor:
     """Return the configuration (d,) that a run directory has stored.
 
     Raises:
         InputError: the scene has another number of coordinates now.
     """
-    u = torch.from_numpy(read_configuration(folder))
+    u = torch.from_numpy(read_configuration(directory))
     if u.shape != problem.domain.start.shape:
         raise InputError(
-            f"{folder}: its configuration has {len(u)} numbers, and its scene has "
+            f"{directory}: its configuration has {len(u)} numbers, and its scene has "
             f"{problem.domain.dim} now: the "
             "object or advsearch has changed since; do the run again"
         )

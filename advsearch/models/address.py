@@ -38,7 +38,7 @@ from torch import Tensor
 from advsearch.extend import InputError, Model, errors, models, stored_files
 
 # Suffix of the path of an address with OpenAI's chat protocol.
-CHAT = "/chat/completions"
+CHAT_SUFFIX = "/chat/completions"
 
 LIMITS: dict[str, float] = {
     "calls": 2000, "at_once": 4, "tokens": float("inf"), "money": float("inf"),
@@ -49,27 +49,31 @@ of concurrent ones; maximum of tokens and money; price of a call and of a millio
 in and out, in the unit of `money`; maximum duration of an answer in seconds.
 """
 
-TRIES = 5
-FIRST_WAIT = 1.0
-LONGEST_WAIT = 60.0
+MAX_TRIES = 5
+FIRST_DELAY = 1.0
+MAX_DELAY = 60.0
 """How often an image is sent to a server that is busy or fails, and the first and
 maximum delay in seconds, which doubles each time.
 """
 
-MOST_AT_ONCE = 64
+MAX_CONCURRENT = 64
 # HTTP statuses of a server that may answer later.
-BUSY = (408, 409, 425, 429, 500, 502, 503, 504, 529)
-LARGEST = 1 << 20  # maximum size of an answer in bytes
+RETRY_STATUSES = (408, 409, 425, 429, 500, 502, 503, 504, 529)
+MAX_ANSWER_BYTES = 1 << 20  # maximum size of an answer in bytes
 # Maximum number of bytes that are read of the body of an HTTP error.
-LONGEST_FAILURE = 2000
-LONGEST = 1000  # maximum number of characters that are stored of an answer in words
+MAX_ERROR_BYTES = 2000
+MAX_ANSWER_CHARACTERS = (
+    1000  # maximum number of characters that are stored of an answer in words
+)
 # Minimum score: its logarithm is the logit of a name that an answer leaves out.
-LEAST = 1e-6
+MIN_SCORE = 1e-6
 REFUSED = "(refused)"  # text of a model that declines to answer
-Levels: TypeAlias = npt.NDArray[np.uint8]  # An image (H, W, 3) with 8 bits per channel
+Image8Bit: TypeAlias = npt.NDArray[
+    np.uint8
+]  # An image (H, W, 3) with 8 bits per channel
 
 
-class KeepsAnswers(Protocol):
+class AnswerStore(Protocol):
     """The store of a run, with its notes."""
 
     def noted(self, key: str) -> Any:
@@ -93,9 +97,9 @@ def load(spec: str, purpose: models.Purpose) -> Model:
             f"key in {models.KEY}; "
             f"{models.how_to_allow(spec)}"
         )
-    chat = address.path.endswith(CHAT)
+    chat = address.path.endswith(CHAT_SUFFIX)
     name = address.fragment or address.netloc
-    free, question = purpose.in_words(name, "is behind an address")
+    free, question = purpose.parse_question(name, "is behind an address")
     if chat and not free:
         raise InputError(
             f"task: a chat such as {name} answers in words; use "
@@ -106,19 +110,21 @@ def load(spec: str, purpose: models.Purpose) -> Model:
             f"model {spec}: expected the name of the chat's model behind "
             f"a #: {spec}#NAME"
         )
-    module = AskedModel(
+    module = AddressModel(
         url=urlunsplit(address._replace(fragment="")),
         name=name,
         spec=spec,
-        limits=limits_of(purpose.ask),
+        limits=resolve_limits(purpose.ask),
         chat=address.fragment if chat else "",
         question=question or (models.QUESTION if free else ""),
         tokens=purpose.tokens,
         times=purpose.times if free else 1,
     )
     if not free:
-        gray_image = np.full((models.SIDE, models.SIDE, 3), 128, np.uint8)
-        module.names = purpose.names or tuple(module.scores([gray_image])[0])
+        gray_image = np.full(
+            (models.DEFAULT_SIZE, models.DEFAULT_SIZE, 3), 128, np.uint8
+        )
+        module.names = purpose.names or tuple(module.request_scores([gray_image])[0])
         if len(module.names) < 2:
             raise errors.ModelError(
                 f"model {name}: expected scores of two names at "
@@ -128,13 +134,15 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         module=module,
         name=name,
         labels=module.names,
-        preprocessing=models.Preprocessing((models.SIDE, models.SIDE), resizes=False),
+        preprocessing=models.Preprocessing(
+            (models.DEFAULT_SIZE, models.DEFAULT_SIZE), resizes=False
+        ),
         batch_limits=(1, 8),
         differentiable=False,
     )
 
 
-def limits_of(ask: Mapping[str, float]) -> dict[str, float]:
+def resolve_limits(ask: Mapping[str, float]) -> dict[str, float]:
     """Return every limit, as set by `ask` or by default.
 
     Raises:
@@ -153,12 +161,12 @@ def limits_of(ask: Mapping[str, float]) -> dict[str, float]:
             )
     limits = {**LIMITS, **ask}
     if not (
-        1 <= limits["at_once"] <= MOST_AT_ONCE
+        1 <= limits["at_once"] <= MAX_CONCURRENT
         and limits["at_once"] == int(limits["at_once"])
     ):
         raise InputError(
             "`ask` at_once: expected a whole number from 1 to "
-            f"{MOST_AT_ONCE}, got {limits['at_once']:g}"
+            f"{MAX_CONCURRENT}, got {limits['at_once']:g}"
         )
     priced = any(
         limits[name] for name in ("per_call", "per_million_in", "per_million_out")
@@ -192,13 +200,15 @@ class _Connection(http.client.HTTPConnection):
     The timeout of a socket starts anew with each byte, so that it is no limit for an answer.
     """
 
-    end = math.inf
+    deadline = math.inf
     connected: socket.socket | None = None
 
     def connect(self) -> None:
         super().connect()
         self.connected = self.sock
-        if time.monotonic() > self.end:  # nobody waits any more, so nothing is sent
+        if (
+            time.monotonic() > self.deadline
+        ):  # nobody waits any more, so nothing is sent
             self.close()
             raise TimeoutError("timed out: connected too late")
 
@@ -215,7 +225,7 @@ class _SecureConnection(_Connection, http.client.HTTPSConnection):
     pass
 
 
-class _NotesConnections(urllib.request.AbstractHTTPHandler):
+class _TracksConnections(urllib.request.AbstractHTTPHandler):
     """Opens connections with a deadline, and lists them for another thread to break off."""
 
     def __init__(self, end: float, connections: list[_Connection]) -> None:
@@ -230,27 +240,27 @@ class _NotesConnections(urllib.request.AbstractHTTPHandler):
 
         def connection_to(host: str, **more: Any) -> _Connection:
             connection = (_SecureConnection if is_secure else _Connection)(host, **more)
-            connection.end = self._end
+            connection.deadline = self._end
             self._connections.append(connection)
             return connection
 
         return super().do_open(connection_to, req, **options)
 
 
-class _Handler(_NotesConnections, urllib.request.HTTPHandler):
+class _Handler(_TracksConnections, urllib.request.HTTPHandler):
     pass
 
 
-class _SecureHandler(_NotesConnections, urllib.request.HTTPSHandler):
+class _SecureHandler(_TracksConnections, urllib.request.HTTPSHandler):
     pass
 
 
 @dataclass(eq=False)
-class AskedModel(models.RemoteNetwork):
+class AddressModel(models.RemoteNetwork):
     """A model behind an address, as a network.
 
     It answers images (N, 3, H, W) in [0, 1], rounded to 8 bits: logits (N, names), or
-    without names the texts about each image (`advsearch.tasks.answers.Texts`). The same
+    without names the texts about each image (`advsearch.tasks.answers.AnswersWithoutLogits`). The same
     image is not sent twice in a run, also if the run is resumed.
 
     Attributes:
@@ -265,7 +275,7 @@ class AskedModel(models.RemoteNetwork):
         names: with scores in answers.
         spent: calls, and tokens in and out, of a run including what it was resumed from.
         store: the run that stores answers and what is spent.
-        known: answers, if no run stores them.
+        answer_cache: answers, if no run stores them.
     """
 
     url: str
@@ -278,8 +288,8 @@ class AskedModel(models.RemoteNetwork):
     times: int
     names: tuple[str, ...] = ()
     spent: Counter[str] = field(default_factory=Counter)
-    store: KeepsAnswers | None = None
-    known: dict[str, dict[str, Any]] = field(default_factory=dict)
+    store: AnswerStore | None = None
+    answer_cache: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __call__(self, pictures: Tensor) -> Any:
         """Return logits (N, names) for images, or the texts about each; see the class."""
@@ -287,13 +297,13 @@ class AskedModel(models.RemoteNetwork):
         images = list(levels.permute(0, 2, 3, 1).cpu().contiguous().numpy())
         if self.names:
             rows = [
-                [max(scores.get(name, 0.0), LEAST) for name in self.names]
-                for scores in self.scores(images)
+                [max(scores.get(name, 0.0), MIN_SCORE) for name in self.names]
+                for scores in self.request_scores(images)
             ]
             return torch.tensor(rows).log()
         requests = [(image, turn) for image in images for turn in range(self.times)]
         texts = []
-        for answer in self._answers(requests):
+        for answer in self._get_answers(requests):
             scores: dict[str, float] = answer.get("scores") or {answer["text"]: 1.0}
             # The likeliest name, if there are scores.
             texts.append(max(scores, key=scores.__getitem__))
@@ -302,14 +312,14 @@ class AskedModel(models.RemoteNetwork):
             for start in range(0, len(texts), self.times)
         ]
 
-    def scores(self, images: Sequence[Levels]) -> list[dict[str, float]]:
+    def request_scores(self, images: Sequence[Image8Bit]) -> list[dict[str, float]]:
         """Return the scores by name in the answer to each image.
 
         Raises:
             ModelError: an answer is in words, or has other names than the labels.
         """
         rows = []
-        for answer in self._answers([(image, 0) for image in images]):
+        for answer in self._get_answers([(image, 0) for image in images]):
             if "scores" not in answer:
                 raise errors.ModelError(
                     f"model {self.name}: answers in words ({answer['text'][:60]!r}), "
@@ -324,7 +334,7 @@ class AskedModel(models.RemoteNetwork):
             rows.append(answer["scores"])
         return rows
 
-    def keep_in(self, store: KeepsAnswers) -> None:
+    def store_answers_in(self, store: AnswerStore) -> None:
         """Store answers and what is spent in a run from now on.
 
         Its stored answers are not requested again, and counts continue.
@@ -332,7 +342,9 @@ class AskedModel(models.RemoteNetwork):
         self.spent += Counter(store.noted(f"asked {self.spec}") or {})
         self.store = store
 
-    def _answers(self, requests: Sequence[tuple[Levels, int]]) -> list[dict[str, Any]]:
+    def _get_answers(
+        self, requests: Sequence[tuple[Image8Bit, int]]
+    ) -> list[dict[str, Any]]:
         """Return the answer to each image and turn: a stored one, or a new one, which is
         stored as it arrives.
 
@@ -342,12 +354,12 @@ class AskedModel(models.RemoteNetwork):
         answers = dict[str, Any]()
         new_bodies = dict[str, dict[str, Any]]()
         for image, turn in requests:
-            body = self._body(image)
+            body = self._make_body(image)
             request = json.dumps([body, turn, self.spec]).encode()
             key = f"answer {hashlib.blake2b(request, digest_size=16).hexdigest()}"
             keys.append(key)
             if self.store is None:
-                answers[key] = self.known.get(key)
+                answers[key] = self.answer_cache.get(key)
             else:
                 answers[key] = self.store.noted(key)
             if not isinstance(answers[key], dict):
@@ -356,15 +368,17 @@ class AskedModel(models.RemoteNetwork):
         for index, response in self._send(list(new_bodies.values())):
             self._count_tokens(response)
             key = new_keys[index]
-            answer = self._read_chat(response) if self.chat else self._read(response)
+            answer = (
+                self._read_chat(response) if self.chat else self._read_plain(response)
+            )
             answers[key] = answer
             if self.store is None:
-                self.known[key] = answer
+                self.answer_cache[key] = answer
             else:
                 self.store.set_note(key, json.dumps(answer))
         return [answers[key] for key in keys]
 
-    def _body(self, image: Levels) -> dict[str, Any]:
+    def _make_body(self, image: Image8Bit) -> dict[str, Any]:
         """Return the JSON body of a request about an image."""
         encoded = base64.b64encode(models.png_of(image)).decode()
         if not self.chat:
@@ -385,7 +399,7 @@ class AskedModel(models.RemoteNetwork):
             "max_tokens": self.tokens,
         }
 
-    def _read(self, response: Mapping[str, Any]) -> dict[str, Any]:
+    def _read_plain(self, response: Mapping[str, Any]) -> dict[str, Any]:
         """Return the answer in a response of the plain protocol, scores or a text."""
         scores = response.get("scores")
         text = response.get("text")
@@ -398,11 +412,11 @@ class AskedModel(models.RemoteNetwork):
             ]
             if not_numbers or not all(0.0 <= value <= 1.0 for value in values):
                 got = not_numbers or [min(values), max(values)]
-                raise self._wrong("scores from 0 to 1", f"{got}")
+                raise self._make_error("scores from 0 to 1", f"{got}")
             return {"scores": scores}
         if isinstance(text, str):
-            return {"text": text[:LONGEST]}
-        raise self._wrong('{"scores": {NAME: SHARE}} or {"text": WORDS}', response)
+            return {"text": text[:MAX_ANSWER_CHARACTERS]}
+        raise self._make_error('{"scores": {NAME: SHARE}} or {"text": WORDS}', response)
 
     def _read_chat(self, response: Mapping[str, Any]) -> dict[str, Any]:
         """Return the text in a response of a chat."""
@@ -412,7 +426,7 @@ class AskedModel(models.RemoteNetwork):
             content = message.get("content")
             refusal = message.get("refusal")
         except (KeyError, IndexError, TypeError, AttributeError):
-            raise self._wrong(
+            raise self._make_error(
                 "choices with a message, as a chat answers", response
             ) from None
         if isinstance(content, list):
@@ -424,15 +438,15 @@ class AskedModel(models.RemoteNetwork):
             if refusal or is_filtered:
                 return {"text": REFUSED}
         if not isinstance(content, str):
-            raise self._wrong("an answer in words", type(content).__name__)
-        return {"text": content[:LONGEST]}
+            raise self._make_error("an answer in words", type(content).__name__)
+        return {"text": content[:MAX_ANSWER_CHARACTERS]}
 
-    def _keep_spent(self) -> None:
+    def _store_spent(self) -> None:
         if self.store is not None:
             self.store.set_note(f"asked {self.spec}", json.dumps(self.spent))
 
     @property
-    def _so_far(self) -> dict[str, float]:
+    def _spent_by_limit(self) -> dict[str, float]:
         """What has been spent, by the name of its limit; money in the unit of the prices."""
         limits = self.limits
         spent = self.spent
@@ -448,9 +462,9 @@ class AskedModel(models.RemoteNetwork):
         }
 
     @property
-    def sentence(self) -> str:
+    def spending_sentence(self) -> str:
         """What a run has spent, as a sentence."""
-        calls, tokens, money = self._so_far.values()
+        calls, tokens, money = self._spent_by_limit.values()
         text = f"The model {self.name} was asked {calls:,} times"
         if tokens:
             text += f", {tokens:,} tokens"
@@ -474,7 +488,9 @@ class AskedModel(models.RemoteNetwork):
             ModelError: a limit is reached, nobody answers, or a response is invalid; the
                 responses up to then are yielded before.
         """
-        pending = [_Request(index, TRIES, FIRST_WAIT) for index in range(len(bodies))]
+        pending = [
+            _Request(index, MAX_TRIES, FIRST_DELAY) for index in range(len(bodies))
+        ]
         max_concurrent = self._max_concurrent()
         while pending:
             models.INTERRUPTS.look()
@@ -501,7 +517,7 @@ class AskedModel(models.RemoteNetwork):
             if failures:
                 raise errors.ModelError(failures[0])
             if retries:
-                time.sleep(min(max(request.delay for request in retries), LONGEST_WAIT))
+                time.sleep(min(max(request.delay for request in retries), MAX_DELAY))
                 delayed = [
                     replace(request, delay=2 * request.delay) for request in retries
                 ]
@@ -518,7 +534,7 @@ class AskedModel(models.RemoteNetwork):
         self, request: _Request, error: Exception, *, first: bool
     ) -> tuple[str, _Request | None]:
         """Return why a request failed, and its next try; None if there is none."""
-        reason, may_retry, retry_after = self._failure(error, first=first)
+        reason, may_retry, retry_after = self._explain_failure(error, first=first)
         text = f"model {self.name}: {reason} ({self.url})"
         if not may_retry or request.tries == 1:
             return text, None
@@ -536,7 +552,7 @@ class AskedModel(models.RemoteNetwork):
         """
         count = 0
         while count < max_count:
-            spent = self._so_far
+            spent = self._spent_by_limit
             reached = [name for name in spent if spent[name] >= self.limits[name]]
             if reached and count:
                 break
@@ -551,7 +567,7 @@ class AskedModel(models.RemoteNetwork):
                 )
             self.spent["calls"] += 1
             count += 1
-        self._keep_spent()
+        self._store_spent()
         return count
 
     def _send_together(
@@ -581,14 +597,14 @@ class AskedModel(models.RemoteNetwork):
         return [future.result() if future in done else timed_out for future in futures]
 
     def _try_to_send(
-        self, body: bytes, end: float, connections: list[_Connection]
+        self, body: bytes, deadline: float, connections: list[_Connection]
     ) -> dict[str, Any] | Exception:
         """Return the response to a body, or the error that a later try may not have."""
         try:
-            return self._sent(body, end, connections)
+            return self._send_body(body, deadline, connections)
         except urllib.error.HTTPError as error:
             with error, suppress(OSError, http.client.HTTPException):
-                text = error.read(LONGEST_FAILURE)
+                text = error.read(MAX_ERROR_BYTES)
                 error = urllib.error.HTTPError(
                     error.url, error.code, error.reason, error.headers, io.BytesIO(text)
                 )
@@ -600,7 +616,9 @@ class AskedModel(models.RemoteNetwork):
         ) as error:  # URLError is an OSError
             return error
 
-    def _failure(self, error: Exception, *, first: bool) -> tuple[str, bool, float]:
+    def _explain_failure(
+        self, error: Exception, *, first: bool
+    ) -> tuple[str, bool, float]:
         """Explain a failure of a request.
 
         Args:
@@ -630,16 +648,16 @@ class AskedModel(models.RemoteNetwork):
                 problem = "is not accepted" if models.read_key() else "is missing"
                 reason = f"status {status}: the key in {models.KEY} {problem}"
             else:
-                body = error.read(LONGEST_FAILURE).decode(errors="replace")
+                body = error.read(MAX_ERROR_BYTES).decode(errors="replace")
                 reason = (
                     f"status {status} {self._clean(str(error.reason))}: "
                     f"{self._clean(body)[:300]}"
                 )
         retry_after = error.headers.get("Retry-After", "")
         seconds = float(retry_after) if retry_after.isdigit() else 0.0
-        return reason, status in BUSY, seconds
+        return reason, status in RETRY_STATUSES, seconds
 
-    def _sent(
+    def _send_body(
         self, body: bytes, deadline: float, connections: list[_Connection]
     ) -> dict[str, Any]:
         """Send one body, and return the JSON object in the response."""
@@ -656,22 +674,22 @@ class AskedModel(models.RemoteNetwork):
         if models.is_local(request.host.rpartition(":")[0].strip("[]") or request.host):
             handlers.append(urllib.request.ProxyHandler({}))
         opener = urllib.request.build_opener(*handlers)
-        max_size = stored_files.scaled(LARGEST)
+        max_size = stored_files.scaled(MAX_ANSWER_BYTES)
         content = bytearray()
         with opener.open(request, timeout=self.limits["seconds"]) as response:
             while chunk := response.read1(1 << 16):
                 content += chunk
                 if len(content) > max_size:
-                    raise self._wrong(
+                    raise self._make_error(
                         f"an answer of at most {max_size:,} bytes", "a longer one"
                     )
         try:
             answer = stored_files.parse_json(content.decode(), finite=True)
         except ValueError as error:  # UnicodeDecodeError is one
             excerpt = self._clean(content[:60].decode(errors="replace"))
-            raise self._wrong("JSON", f"{excerpt!r} ({error})") from None
+            raise self._make_error("JSON", f"{excerpt!r} ({error})") from None
         if not isinstance(answer, dict):
-            raise self._wrong("a JSON object", type(answer).__name__)
+            raise self._make_error("a JSON object", type(answer).__name__)
         return answer
 
     def _clean(self, text: str) -> str:
@@ -682,7 +700,9 @@ class AskedModel(models.RemoteNetwork):
         printable = "".join(char if char.isprintable() else " " for char in text)
         return " ".join(printable.split())
 
-    def _wrong(self, expected: str, got: str | Mapping[str, Any]) -> errors.ModelError:
+    def _make_error(
+        self, expected: str, got: str | Mapping[str, Any]
+    ) -> errors.ModelError:
         """Return the error for an answer that is something else, or an object with other keys."""
         if isinstance(got, Mapping):
             got = self._clean(", ".join(map(str, got)) or "nothing")[:100]
@@ -707,9 +727,9 @@ class AskedModel(models.RemoteNetwork):
         if is_stated:
             tokens_in, tokens_out = counts
             self.spent.update(tokens_in=tokens_in, tokens_out=tokens_out)
-            self._keep_spent()
+            self._store_spent()
         elif self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token:
-            raise self._wrong(
+            raise self._make_error(
                 "`usage` with prompt_tokens and completion_tokens, as "
                 "`ask` counts tokens",
                 "none",

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, final
 import torch
 from torch import Tensor, fx, nn
 
-from advsearch.models.model import Model, checked_images, joined
+from advsearch.models.model import Model, check_images, join_outputs
 
 LAYERS = (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)
 
@@ -61,10 +61,10 @@ class Features:
         Raises:
             InputError: not an image, or values that are clearly not in [0, 1].
         """
-        images = checked_images(images)
+        images = check_images(images)
         batches = images.split(self.model.batch_limits[1])
-        features: Tensor = joined(
-            [self.read(self.model.prepared(b))[: len(b)].float() for b in batches]
+        features: Tensor = join_outputs(
+            [self.read(self.model.prepare(b))[: len(b)].float() for b in batches]
         )
         return features.to(images.device)
 
@@ -76,9 +76,9 @@ def features_of(model: Model) -> Features:
     batch_size = min(2, model.batch_limits[1])
     gray = torch.full((batch_size, *model.input_size, 3), 0.5)
     with torch.no_grad():
-        x = model.prepared(gray)
-        for trace_calls in (_of_modules, _of_graph):
-            last = _last(trace_calls, model, x)
+        x = model.prepare(gray)
+        for trace_calls in (_trace_modules, _trace_graph):
+            last = _find_last_layer(trace_calls, model, x)
             if last is not None:
                 read, source = last
                 size = read(x).shape[1]
@@ -89,7 +89,7 @@ def features_of(model: Model) -> Features:
     )
 
     def center_logits(x: Tensor) -> Tensor:
-        logits: Tensor = model.ask(x)
+        logits: Tensor = model.run_network(x)
         return logits - logits.mean(dim=1, keepdim=True)
 
     return Features(model, center_logits, model.classes, source, penultimate=False)
@@ -113,7 +113,7 @@ their order.
 """
 
 
-def _last(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
+def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
     """Find the features (N, F) of the last layer of a network.
 
     They are its input if it is the head, else its output, averaged over all axes but
@@ -150,7 +150,7 @@ def _last(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
     return read, f"{attribute} of {last.name}"
 
 
-def _of_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
+def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
     """Return the calls of the layers of a module, or of one layer."""
     calls: list[_Call] = []
     if not isinstance(network, nn.Module) or isinstance(
@@ -189,7 +189,7 @@ def _of_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
     return calls
 
 
-def _of_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
+def _trace_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
     """Return the calls of the layers of a graph of operators, such as a `torch.export` program."""
     calls: list[_Call] = []
 

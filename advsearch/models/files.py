@@ -25,8 +25,8 @@ from torch import Tensor, nn
 from advsearch.errors import FileFormatError, ModelError
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.inputs import SIZE_INPUTS, SIZE_TYPES, EightBitInput
-from advsearch.models.labels import names_in
-from advsearch.models.source import Source, library, source_of
+from advsearch.models.labels import parse_names
+from advsearch.models.source import Source, import_library, make_source
 from advsearch.trust import exported_programs
 from advsearch.trust.archives import (
     LARGEST,
@@ -62,7 +62,7 @@ EXPORT_HINT = (
     "'package.module:callable@weights.safetensors'"
 )
 
-LARGEST_BATCH = 64  # maximum batch size of a program whose batch dimension is free
+MAX_BATCH = 64  # maximum batch size of a program whose batch dimension is free
 
 
 def load_file(path: Path) -> Source:
@@ -92,19 +92,23 @@ def load_file(path: Path) -> Source:
         if path.suffix.lower() == ".onnx":
             return load_onnx(path)
         if head[:2] != b"PK":
-            raise FileFormatError(f"model file {path}: {_not_an_archive(path, head)}")
+            raise FileFormatError(f"model file {path}: {_describe_file(path, head)}")
         archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
-        if _kind(archive) == "torchscript":
+        if _find_archive_kind(archive) == "torchscript":
             return _load_torchscript(archive)
         checked = exported_programs.rewritten(archive)
         logger = logging.getLogger("torch.export")
-        with _damaged(path, "torch.export"), without_unpickling(), ExitStack() as stack:
+        with (
+            _report_corrupt(path, "torch.export"),
+            without_unpickling(),
+            ExitStack() as stack,
+        ):
             # torch logs a traceback of what is rejected with a message anyway.
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
             program = torch.export.load(checked)
             module = program.module()
-        return _with_signature(source_of(module, path.stem), program)
+        return _apply_signature(make_source(module, path.stem), program)
 
 
 def _hint_of_missing(path: Path) -> str:
@@ -127,7 +131,7 @@ def _load_torchscript(archive: Archive) -> Source:
         problem = try_torchscript(checked)
         if problem:
             raise FileFormatError(f"model file {path}: {problem}")
-    with warnings.catch_warnings(), _damaged(path, "TorchScript"):
+    with warnings.catch_warnings(), _report_corrupt(path, "TorchScript"):
         # torch 2.14 and later warn by the second category.
         for category in (DeprecationWarning, FutureWarning):
             warnings.filterwarnings(
@@ -136,10 +140,10 @@ def _load_torchscript(archive: Archive) -> Source:
                 category=category,
             )
         module = torch.jit.load(checked, map_location="cpu")
-    return source_of(module, path.stem)
+    return make_source(module, path.stem)
 
 
-def _kind(archive: Archive) -> str:
+def _find_archive_kind(archive: Archive) -> str:
     """Return ``"exported"`` or ``"torchscript"``; raise FileFormatError for anything else."""
     path = archive.path
     names = archive.members
@@ -172,7 +176,7 @@ def _kind(archive: Archive) -> str:
     )
 
 
-def _not_an_archive(path: Path, head: bytes) -> str:
+def _describe_file(path: Path, head: bytes) -> str:
     """Describe a file that is no zip archive by its first bytes and its suffix."""
     if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 1 << 30:
         return (
@@ -201,7 +205,7 @@ def _not_an_archive(path: Path, head: bytes) -> str:
     )
 
 
-def _with_signature(source: Source, program: torch.export.ExportedProgram) -> Source:
+def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> Source:
     """Return the source with what the program's signature shows: input size, layout,
     batch limits, dtype.
 
@@ -257,7 +261,9 @@ def _with_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
         input_size=(height, width) if is_fixed_size else None,
         layout="NHWC" if is_channels_last else "NCHW",
     )
-    return as_eight_bit(source) if is_eight_bit else replace(source, dtype=images.dtype)
+    return (
+        make_eight_bit(source) if is_eight_bit else replace(source, dtype=images.dtype)
+    )
 
 
 def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
@@ -281,7 +287,7 @@ def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
     if not is_rig and not is_image:
         raise ModelError(
             f"model {source.name}: expected a program with one input, a batch of "
-            f"images of 4 dimensions{_second_input(names)}"
+            f"images of 4 dimensions{_advise_on_second_input(names)}"
         )
     return is_rig
 
@@ -292,12 +298,12 @@ def _batch_limits(program: torch.export.ExportedProgram, batch: Any) -> tuple[in
         return batch, batch
     allowed = program.range_constraints.get(batch.node.expr)
     if allowed is None:
-        return 1, LARGEST_BATCH
+        return 1, MAX_BATCH
     min_batch = max(int(allowed.lower), 1)
-    return min_batch, max(min_batch, int(min(allowed.upper, LARGEST_BATCH)))
+    return min_batch, max(min_batch, int(min(allowed.upper, MAX_BATCH)))
 
 
-def as_eight_bit(source: Source) -> Source:
+def make_eight_bit(source: Source) -> Source:
     """Return the source of a network that takes uint8 as one that takes floating-point images
     from 0 to 255.
     """
@@ -309,7 +315,7 @@ def as_eight_bit(source: Source) -> Source:
     )
 
 
-def _second_input(names: list[str]) -> str:
+def _advise_on_second_input(names: list[str]) -> str:
     """Return what to do about a network of two inputs whose second is unknown; "" for others."""
     if len(names) != 2:
         return ""
@@ -322,7 +328,7 @@ def _second_input(names: list[str]) -> str:
     )
 
 
-def _damaged(path: Path, kind: str) -> AbstractContextManager[None]:
+def _report_corrupt(path: Path, kind: str) -> AbstractContextManager[None]:
     """Turn whatever torch raises while it reads a file into a FileFormatError."""
     problem = (
         f"model file {path}: cannot be read as {kind} with torch {torch.__version__}"
@@ -337,7 +343,7 @@ FLOATS = {
     "tensor(double)": torch.float64,
 }
 
-OLDEST = (1, 24)
+MIN_VERSION = (1, 24)
 """The first onnxruntime that reads no weights from outside the directory of a file;
 older ones follow `../` and links.
 """
@@ -401,21 +407,21 @@ def load_onnx(path: Path) -> Source:
         path.stem,
         input_size=(input_size[0], input_size[1]) if input_size else None,
         layout="NHWC" if is_channels_last else "NCHW",
-        labels=names_in(metadata.get("names", "")),
-        batch_limits=(batch, batch) if isinstance(batch, int) else (1, LARGEST_BATCH),
+        labels=parse_names(metadata.get("names", "")),
+        batch_limits=(batch, batch) if isinstance(batch, int) else (1, MAX_BATCH),
         dtype=torch.float32 if is_eight_bit else FLOATS[images.type],
         size_type=SIZE_TYPES[inputs[1].type] if len(inputs) > 1 else None,
     )
-    return as_eight_bit(source) if is_eight_bit else source
+    return make_eight_bit(source) if is_eight_bit else source
 
 
 def _open_session(path: Path) -> tuple[Any, Any]:
     """Return a session of onnxruntime with the network in a file, and onnxruntime."""
-    runtime = library("onnxruntime", str(path), "onnx")
+    runtime = import_library("onnxruntime", str(path), "onnx")
     release = re.match(r"(\d+)\.(\d+)", runtime.__version__)
-    if release is None or (int(release[1]), int(release[2])) < OLDEST:
+    if release is None or (int(release[1]), int(release[2])) < MIN_VERSION:
         raise ModelError(
-            f"model {path}: needs onnxruntime {'.'.join(map(str, OLDEST))} or newer, "
+            f"model {path}: needs onnxruntime {'.'.join(map(str, MIN_VERSION))} or newer, "
             f"got {runtime.__version__}, which "
             "may read weights from anywhere that a file names: pip install -U "
             "'advsearch[onnx]'"
@@ -464,7 +470,7 @@ def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
     raise ModelError(
         f"model file {path}: expected one input, a batch of floating-point images "
         "of 4 dimensions (or of uint8), "
-        f"got {got or 'none'}{_second_input([tensor.name for tensor in inputs])}"
+        f"got {got or 'none'}{_advise_on_second_input([tensor.name for tensor in inputs])}"
     )
 
 

@@ -76,7 +76,7 @@ class EightBitInput(nn.Module):
         )
 
 
-def names_of_inputs(network: nn.Module) -> list[str]:
+def list_required_inputs(network: nn.Module) -> list[str]:
     """Return the names of the required inputs of a network; empty if Python does not
     know them.
     """
@@ -100,7 +100,7 @@ def names_of_inputs(network: nn.Module) -> list[str]:
 
 def takes_image_size(network: nn.Module) -> bool:
     """Whether a network takes images and their sizes, by the names of its inputs."""
-    names = names_of_inputs(network)
+    names = list_required_inputs(network)
     return len(names) == 2 and names[1] in SIZE_INPUTS
 
 

@@ -16,10 +16,14 @@ from advsearch.trust.stored_files import parse_json, read_text
 
 # the text that a name is put into where nothing else is said
 PROMPT = "a photo of a {}"
-LARGEST = 16 << 20  # bytes of a label file
-LONGEST = 1000  # characters of a label name; those of ImageNet have up to 130
-LONGEST_NAMES = 1 << 20  # characters of all names that a network's metadata say
-MOST_SUGGESTIONS = 4  # labels that a message suggests for an unknown one
+MAX_FILE_BYTES = 16 << 20  # bytes of a label file
+MAX_NAME_CHARACTERS = (
+    1000  # characters of a label name; those of ImageNet have up to 130
+)
+MAX_METADATA_CHARACTERS = (
+    1 << 20
+)  # characters of all names that a network's metadata say
+MAX_SUGGESTIONS = 4  # labels that a message suggests for an unknown one
 DATA = Path(__file__).parent / "data"
 SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco90", "coco91", "voc")
 """Names of the classes of data sets that many networks are trained on, in the order of
@@ -28,7 +32,7 @@ of which 11 have no class; `coco90` is that without background; `voc` has the ba
 first.
 """
 
-NOTHING = frozenset(
+NOTHING_NAMES = frozenset(
     "background bg noobject noobj noclass nothing none null void n/a n.a. unlabeled "
     "unlabelled unused ??? ∅".split()
 )
@@ -37,11 +41,11 @@ NOTHING = frozenset(
 """
 
 
-def names_nothing(name: str) -> bool:
+def is_nothing_name(name: str) -> bool:
     """Whether the name of a class stands for no thing: background, "no object", an index
     without a class.
     """
-    return re.sub(r"[\s_<>()\[\]-]+", "", name.casefold()) in NOTHING
+    return re.sub(r"[\s_<>()\[\]-]+", "", name.casefold()) in NOTHING_NAMES
 
 
 @dataclass(frozen=True)
@@ -90,12 +94,14 @@ def find_label_set(
         raise InputError(
             f"label: expected at least one label name or class index, got {text!r}"
         )
-    table = _name_table(labels)
-    indices = tuple(dict.fromkeys(_find(term, table, labels, named) for term in terms))
+    table = _make_name_table(labels)
+    indices = tuple(
+        dict.fromkeys(_find_class(term, table, labels, named) for term in terms)
+    )
     return LabelSet(tuple(labels[index] for index in indices), indices)
 
 
-def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
+def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     """Find the classes whose names resemble a word, best first, then its synonyms.
 
     Resemblance is that of `resembling`; synonyms ("cup" for "mug") come from a table of
@@ -107,14 +113,14 @@ def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     """
     table = {
         name: indices
-        for name, indices in _name_table(labels).items()
+        for name, indices in _make_name_table(labels).items()
         if "," not in name
     }
     synonym_groups = json.loads((DATA / "synonyms.json").read_text("utf-8"))
-    key = _key(word)
+    key = _normalize_name(word)
     synonyms = []
     for group in synonym_groups:
-        names = [_key(name) for name in group]
+        names = [_normalize_name(name) for name in group]
         if key in names:
             synonyms += [name for name in names if name in table]
     similar = resembling(word, table)
@@ -128,7 +134,7 @@ def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     return list(name_of_index.items())
 
 
-def _find(
+def _find_class(
     term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool
 ) -> int:
     """Return the index of the class of a term.
@@ -142,7 +148,7 @@ def _find(
     Raises:
         InputError: there is no such class, or several.
     """
-    indices = table.get(_key(term), [])
+    indices = table.get(_normalize_name(term), [])
     number = re.fullmatch(r"#\s*(-?\d+)", term)
     if not number and not indices:
         number = re.fullmatch(r"(-?\d+)", term)
@@ -169,12 +175,14 @@ def _find(
 def _hint_of_labels(term: str, labels: Sequence[str], named: bool) -> str:
     """Return a hint for an unknown label: names like it, or what labels there are."""
     if not named:
-        fitting = "".join(f" or `labels={name}`" for name in sets_of(len(labels)))
+        fitting = "".join(
+            f" or `labels={name}`" for name in list_sets_of_size(len(labels))
+        )
         return (
             f"Its {len(labels)} classes have no names: give a label file "
             f"(`labels`){fitting}, or an index such as '#0'"
         )
-    similar = matching_labels(term, labels)[:MOST_SUGGESTIONS]
+    similar = find_similar_labels(term, labels)[:MAX_SUGGESTIONS]
     if similar:
         names = " or ".join(f"{name!r} (#{index})" for index, name in similar)
         return f"Did you mean {names}?"
@@ -182,18 +190,20 @@ def _hint_of_labels(term: str, labels: Sequence[str], named: bool) -> str:
     return f"Its {len(labels)} labels: {', '.join(labels[:20])}{suffix}"
 
 
-def _key(name: str) -> str:  # what is compared
+def _normalize_name(name: str) -> str:  # what is compared
     """Return a name in the form in which names are compared."""
     return " ".join(name.casefold().split())
 
 
-def _name_table(labels: Sequence[str]) -> dict[str, list[int]]:
+def _make_name_table(labels: Sequence[str]) -> dict[str, list[int]]:
     """Return, for every full name and every synonym, the class indices that carry it,
     ascending.
     """
     table: dict[str, list[int]] = {}
     for index, label in enumerate(labels):
-        for name in dict.fromkeys(_key(part) for part in (label, *label.split(","))):
+        for name in dict.fromkeys(
+            _normalize_name(part) for part in (label, *label.split(","))
+        ):
             if name:
                 table.setdefault(name, []).append(index)
     return table
@@ -218,18 +228,18 @@ def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ..
     """
     if isinstance(source, (str, os.PathLike)):
         if str(source) in SETS:
-            return _label_sets()[str(source)]
-        if not _lists_names(source):
+            return _load_label_sets()[str(source)]
+        if not _is_name_list(source):
             return _read_file(Path(source))
         source = str(source).split(",")
     if not isinstance(source, Sequence):
         raise InputError(
             f"labels: expected a path or a list of names, got {type(source).__name__}"
         )
-    return _checked(source, InputError, "labels")
+    return _check_names(source, InputError, "labels")
 
 
-def names_in(names: Any) -> tuple[str, ...] | None:
+def parse_names(names: Any) -> tuple[str, ...] | None:
     """Return the names of classes that a network states, in order, as YOLO's do in `names` and
     in the metadata of their files.
 
@@ -237,7 +247,7 @@ def names_in(names: Any) -> tuple[str, ...] | None:
     one; None for anything else.
     """
     if isinstance(names, str):
-        if len(names) > LONGEST_NAMES or not _FLAT.fullmatch(names):
+        if len(names) > MAX_METADATA_CHARACTERS or not _FLAT.fullmatch(names):
             return None
         try:
             names = ast.literal_eval(names)
@@ -247,7 +257,7 @@ def names_in(names: Any) -> tuple[str, ...] | None:
         names = list(names.values()) if list(names) == list(range(len(names))) else None
     return (
         read_labels(names)
-        if isinstance(names, (list, tuple)) and not _problem(names)
+        if isinstance(names, (list, tuple)) and not _find_problem(names)
         else None
     )
 
@@ -260,7 +270,7 @@ _FLAT = re.compile(
 """A mapping or a list as Python writes it: nothing in it is deep or runs."""
 
 
-def _lists_names(source: str | os.PathLike[str]) -> bool:
+def _is_name_list(source: str | os.PathLike[str]) -> bool:
     """Whether a text is names with commas between them, not the path of a file, which may be
     missing.
     """
@@ -284,7 +294,7 @@ def find_labels_origin(labels: object) -> LabelsOrigin:
     if labels is None:
         return LabelsOrigin("labels of the model")
     is_path = isinstance(labels, (str, os.PathLike)) and str(labels) not in SETS
-    if is_path and not _lists_names(labels):  # type: ignore[arg-type]
+    if is_path and not _is_name_list(labels):  # type: ignore[arg-type]
         return LabelsOrigin(f"label file {labels}", is_file=True)
     return LabelsOrigin()
 
@@ -309,7 +319,7 @@ def read_prompts(prompts: str | Sequence[str] | None) -> tuple[str, ...] | None:
     return tuple(texts)
 
 
-def patterns(prompts: tuple[str, ...] | None) -> tuple[str, ...]:
+def get_patterns(prompts: tuple[str, ...] | None) -> tuple[str, ...]:
     """Return the prompts that names are inserted into for ``{}``; the default for None.
 
     Raises:
@@ -324,19 +334,19 @@ def patterns(prompts: tuple[str, ...] | None) -> tuple[str, ...]:
     return prompts or (PROMPT,)
 
 
-def sets_of(classes: int) -> list[str]:
+def list_sets_of_size(classes: int) -> list[str]:
     """Return the names of `SETS` with that many classes."""
-    return [name for name, names in _label_sets().items() if len(names) == classes]
+    return [name for name, names in _load_label_sets().items() if len(names) == classes]
 
 
-def _label_sets() -> dict[str, tuple[str, ...]]:
+def _load_label_sets() -> dict[str, tuple[str, ...]]:
     """Load the names of classes of all `SETS`."""
     stored = json.loads((DATA / "labels.json").read_text("utf-8"))
     stored["coco90"] = stored["coco91"][1:]
     return {name: tuple(stored[name]) for name in SETS}
 
 
-def fitting_labels(
+def fit_labels(
     classes: int, labels: tuple[str, ...] | None, origin: LabelsOrigin, model: str
 ) -> tuple[str, ...]:
     """Return the labels, or placeholders for None.
@@ -353,7 +363,7 @@ def fitting_labels(
         f"{origin.text}: {len(labels)} labels, but model {model} has {classes} "
         "classes; give one per class, in index "
         "order"
-        f"{''.join(f' (`labels={name}` has {classes})' for name in sets_of(classes))}"
+        f"{''.join(f' (`labels={name}` has {classes})' for name in list_sets_of_size(classes))}"
     )
     raise FileFormatError(message) if origin.is_file else InputError(message)
 
@@ -362,7 +372,7 @@ def _read_file(path: Path) -> tuple[str, ...]:
     """Read label names from a JSON or text file; see `read_labels`."""
     where = f"label file {path}"
     try:
-        text = read_text(path, "a label file", LARGEST)
+        text = read_text(path, "a label file", MAX_FILE_BYTES)
     except OSError as error:
         advice = (
             ""
@@ -399,21 +409,21 @@ def _read_file(path: Path) -> tuple[str, ...]:
         raise FileFormatError(
             f"{where}: expected a list of names or an object from index to name"
         )
-    return _checked(names, FileFormatError, where)
+    return _check_names(names, FileFormatError, where)
 
 
-def _checked(
+def _check_names(
     names: Sequence[Any], kind: type[InputError], where: str
 ) -> tuple[str, ...]:
     """Return label names without surrounding spaces; raise an error of a kind if one is
     invalid.
     """
-    if problem := _problem(names):
+    if problem := _find_problem(names):
         raise kind(f"{where}: {problem}")
     return tuple(name.strip() for name in names)
 
 
-def _problem(names: Sequence[Any]) -> str:
+def _find_problem(names: Sequence[Any]) -> str:
     """Return what is wrong with label names, "" if nothing is."""
     if not names:
         return "expected label names, got an empty list"
@@ -423,9 +433,9 @@ def _problem(names: Sequence[Any]) -> str:
                 f"expected a name (non-empty text) for class {index}, got "
                 f"{repr(name)[:60]}"
             )
-        if len(name) > LONGEST:
+        if len(name) > MAX_NAME_CHARACTERS:
             return (
-                f"expected a name of at most {LONGEST} characters for class "
+                f"expected a name of at most {MAX_NAME_CHARACTERS} characters for class "
                 f"{index}, got {len(name):,}"
             )
     return ""

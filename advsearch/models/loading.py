@@ -20,8 +20,8 @@ from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
 from advsearch.models.labels import (
     LabelsOrigin,
     find_labels_origin,
-    fitting_labels,
-    names_in,
+    fit_labels,
+    parse_names,
     read_labels,
     read_prompts,
 )
@@ -31,10 +31,10 @@ from advsearch.models.source import (
     Purpose,
     Source,
     load_callable,
-    source_of,
+    make_source,
     split_weights,
 )
-from advsearch.registry import Registry, imported
+from advsearch.registry import Registry, load_attribute
 from advsearch.trust.foreign_code import called_under, plainly, turned_by_code
 
 DEFAULT_INPUT_SIZE = (224, 224)  # if neither the model nor the caller states one
@@ -48,7 +48,7 @@ SOURCES: Registry[Callable[..., Source | Model]] = Registry(
 """Loaders of ``SOURCE:NAME`` by source."""
 
 # Sources whose loader takes a `Purpose`.
-FOR_A_PURPOSE = ("timm", "hf", "http", "https")
+SOURCES_WITH_PURPOSE = ("timm", "hf", "http", "https")
 
 FORMS = (
     "A model is 'reference', a file (.pt2, TorchScript or .onnx), 'torchvision:NAME', "
@@ -182,11 +182,11 @@ def load_model(
             source,
             name=name or source.name,
             read=read or source.read,
-            asked=source.asked if is_unchanged else None,
+            spec=source.spec if is_unchanged else None,
         )
         if names is not None:
             if model.read is None:  # other tasks count the classes by themselves
-                names = fitting_labels(model.classes, names, origin, model.name)
+                names = fit_labels(model.classes, names, origin, model.name)
             model = replace(model, labels=names, named=True)
     else:
         if read is not None and isinstance(source.module, nn.Module):
@@ -195,7 +195,7 @@ def load_model(
         model = _probe_source(source, options, read, name, names, origin)
     is_named_alone = not options and labels is None and name is None
     if isinstance(spec, (str, os.PathLike)) and is_named_alone:
-        return replace(model, asked=os.fspath(spec))
+        return replace(model, spec=os.fspath(spec))
     return model
 
 
@@ -206,7 +206,7 @@ def _with_training_arguments(source: Source) -> Source:
     input_size = (size, size) if isinstance(size, int) and size > 1 else None
     return replace(
         source,
-        labels=source.labels or names_in(getattr(source.module, "names", None)),
+        labels=source.labels or parse_names(getattr(source.module, "names", None)),
         input_size=source.input_size or input_size,
     )
 
@@ -256,7 +256,7 @@ def _with_images_alone(
     return WithImageSize(source.module, source.size_type, preprocessing.layout)
 
 
-def named_code(spec: str) -> str | None:
+def parse_code_reference(spec: str) -> str | None:
     """Return the "package.module:attribute" that a model's name imports, None if it imports
     nothing.
     """
@@ -274,7 +274,7 @@ def _find_source(spec: object, purpose: Purpose) -> Source | Model:
         return spec
     if isinstance(spec, nn.Module):
         library_source = _find_library_source(spec, purpose)
-        return library_source or source_of(spec, type(spec).__name__)
+        return library_source or make_source(spec, type(spec).__name__)
     if isinstance(spec, os.PathLike):
         return files.load_file(Path(spec))
     if not isinstance(spec, str):
@@ -292,12 +292,12 @@ def _find_source(spec: object, purpose: Purpose) -> Source | Model:
     source = text.partition(":")[0].lower()
     if ":" in text and source in SOURCES:
         load = SOURCES[source]
-        return load(text, purpose) if source in FOR_A_PURPOSE else load(text)
+        return load(text, purpose) if source in SOURCES_WITH_PURPOSE else load(text)
     if re.fullmatch(r"[\w.-]+\.py:[\w.]+", text):
         raise InputError(
             f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'"
         )
-    if named_code(text) is not None:
+    if parse_code_reference(text) is not None:
         return load_callable(text, SOURCES)
     if (
         Path(text).suffix.lower() in files.SUFFIXES
@@ -331,7 +331,7 @@ def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
     """Return the source of a network of transformers or timm; None for any other network."""
     for library, recognizer in list_built_ins("recognizer").items():
         if library in sys.modules:
-            recognize: Callable[[nn.Module, Purpose], Source | None] = imported(
+            recognize: Callable[[nn.Module, Purpose], Source | None] = load_attribute(
                 recognizer.target
             )
             source = recognize(network, purpose)

@@ -76,14 +76,14 @@ class _Recomputed(torch.autograd.Function):
         return None, None, image_gradient
 
 
-def recomputed(ask: Callable[[Tensor], Any], images: Tensor) -> Any:
+def compute_checkpointed(function: Callable[[Tensor], Any], images: Tensor) -> Any:
     """Return `ask(images)`: tensors, in lists and mappings, without storing activations.
 
     Its gradient computes it a second time, and takes the memory of one batch instead of that
     of all (Chen et al. 2016, *Training Deep Nets with Sublinear Memory Cost*, section 3).
     """
     structure: list[Any] = []
-    tensors = _Recomputed.apply(ask, structure, images)  # type: ignore[no-untyped-call]
+    tensors = _Recomputed.apply(function, structure, images)  # type: ignore[no-untyped-call]
     return tree_unflatten(list(tensors), structure[0])
 
 
@@ -107,14 +107,14 @@ ValueError with what was expected.
 
 # Smaller probabilities are clamped to this before the logarithm: its derivative is
 # finite in float32.
-SMALLEST_PROBABILITY = 1e-30
+MIN_PROBABILITY = 1e-30
 # How far outside [0, 1] a pixel may lie: finite differences overshoot a little.
 RANGE_TOLERANCE = 0.01
 # Maximum number of images of a rig whose activations are stored; for more, the network
 # recomputes them.
-KEPT = 4
+MAX_STORED_IMAGES = 4
 
-GIVEN_BY = {
+OUTPUTS_BY_TASK = {
     "classification": "a row of scores is what a classifier gives",
     "detection": "boxes are what a detector gives",
     "segmentation": "a score for each pixel is what a segmenter gives",
@@ -133,11 +133,11 @@ class RemoteNetwork:
         raise NotImplementedError
 
     @property
-    def sentence(self) -> str:
+    def spending_sentence(self) -> str:
         """What a run has spent, as a sentence."""
         raise NotImplementedError
 
-    def keep_in(self, store: Any) -> None:
+    def store_answers_in(self, store: Any) -> None:
         """Store answers and what is spent in an `advsearch.runs.store.Store` from now
         on.
         """
@@ -226,7 +226,7 @@ class Model:
 
     Args:
         module: the network. It takes what `preprocessing` returns and returns what
-            `logits_of` describes.
+            `read_logits` describes.
         name: its name in messages and results.
         labels: one name per class, in index order.
         preprocessing: of an image.
@@ -236,13 +236,13 @@ class Model:
             differences are log-odds.
         differentiable: a gradient of the logits reaches the image.
         attached: its gradient is that of its outputs only if `detach` is ignored, see
-            `Detaching`.
+            `DetachMode`.
         named: False if `labels` are placeholders.
         dtype: of the network's floating-point input.
         device: of the network. Images go there, the output comes back.
         read: reads the output from what the network returns for a number of images: a
             tensor (N, ...), or a list with one element for each; None for logits.
-        asked: the argument of `load_model`, if that is all that defines the model; None
+        spec: the argument of `load_model`, if that is all that defines the model; None
             for what exists in this session only.
         cameras: how many images of a rig are side by side in each image. The network sees
             them one by one; the output is then a list with a tuple of theirs for each
@@ -264,7 +264,7 @@ class Model:
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
     read: Read | None = field(default=None, repr=False)
-    asked: str | None = field(default=None, repr=False)
+    spec: str | None = field(default=None, repr=False)
     cameras: int = 1
     make_trainable: Callable[[], nn.Module] | None = field(default=None, repr=False)
 
@@ -301,7 +301,7 @@ class Model:
             ModelError: the network's output is not (N, classes), or `read` finds no
                 output in it.
         """
-        images = checked_images(images)
+        images = check_images(images)
         max_batch = self.batch_limits[1]
         recomputes = False
         if self.cameras > 1:
@@ -310,12 +310,12 @@ class Model:
             max_batch = max(full_rigs, min(max_batch, self.cameras))
             recomputes = (
                 not isinstance(self.module, AllAtOnce)
-                and len(images) > KEPT
+                and len(images) > MAX_STORED_IMAGES
                 and images.requires_grad
                 and torch.is_grad_enabled()
             )
             if recomputes:
-                max_batch = min(max_batch, KEPT)
+                max_batch = min(max_batch, MAX_STORED_IMAGES)
 
         def return_to_device(output: Tensor) -> Tensor:
             # A copy, because a network may write into the same memory again.
@@ -324,14 +324,14 @@ class Model:
             return returned.clone() if is_same_memory else returned
 
         def run_batch(batch: Tensor) -> Any:
-            output = self.ask(self.prepared(batch))[: len(batch)]
-            return each_tensor(output, return_to_device)
+            output = self.run_network(self.prepare(batch))[: len(batch)]
+            return map_tensors(output, return_to_device)
 
         outputs = [
-            recomputed(run_batch, batch) if recomputes else run_batch(batch)
+            compute_checkpointed(run_batch, batch) if recomputes else run_batch(batch)
             for batch in images.split(max_batch)
         ]
-        output = outputs[0] if len(outputs) == 1 else joined(outputs)
+        output = outputs[0] if len(outputs) == 1 else join_outputs(outputs)
         if self.cameras == 1:
             return output
         image_outputs = [output[index : index + 1] for index in range(len(output))]
@@ -363,7 +363,7 @@ class Model:
 
         It sees the weights as they are trained in place, and collects no gradients for them.
         """
-        shared = sharing_copy(network).eval().requires_grad_(False)
+        shared = copy_sharing_weights(network).eval().requires_grad_(False)
         return replace(self, module=shared, make_trainable=None)
 
     def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
@@ -372,7 +372,7 @@ class Model:
         """
         return find_label_set(text, self.labels, named=self.named)
 
-    def prepared(self, images: Tensor) -> Tensor:
+    def prepare(self, images: Tensor) -> Tensor:
         """Preprocess images (N, H, W, 3), at most a batch of them, for the network.
 
         They get the network's dtype and device. Too small a batch is padded with the last
@@ -387,7 +387,7 @@ class Model:
         is_view = x.untyped_storage().data_ptr() == images.untyped_storage().data_ptr()
         return x.clone() if is_view else x
 
-    def ask(self, x: Tensor, *, raw: bool = False) -> Any:
+    def run_network(self, x: Tensor, *, raw: bool = False) -> Any:
         """Run the network on a batch that `prepared` returned.
 
         Returns:
@@ -395,21 +395,21 @@ class Model:
         """
         INTERRUPTS.look()
         ignores_detach = self.attached and torch.is_grad_enabled()
-        mode = Detaching(ignored=True) if ignores_detach else nullcontext()
+        mode = DetachMode(ignored=True) if ignores_detach else nullcontext()
         # The network may switch gradients off as it runs.
         with mode, torch.set_grad_enabled(torch.is_grad_enabled()):
             returned = self.module(x)
         if raw:
             return returned
         if self.read is not None:
-            return read_by(self.read, returned, len(x), self.name)
-        logits = logits_of(returned, len(x), len(self.labels), self.name)
+            return read_output(self.read, returned, len(x), self.name)
+        logits = read_logits(returned, len(x), len(self.labels), self.name)
         if self.probabilities:
-            return logits.clamp_min(SMALLEST_PROBABILITY).log()
+            return logits.clamp_min(MIN_PROBABILITY).log()
         return logits
 
 
-def sharing_copy(module: nn.Module) -> nn.Module:
+def copy_sharing_weights(module: nn.Module) -> nn.Module:
     """Return a copy that shares the weights, but has gradients of its own.
 
     Weights that were created in `torch.inference_mode` are copied: nothing can be
@@ -431,34 +431,34 @@ def sharing_copy(module: nn.Module) -> nn.Module:
 DETACHING = (torch.Tensor.detach, torch.Tensor.detach_, torch.detach, torch.detach_)
 
 
-class Detaching(TorchFunctionMode):
+class DetachMode(TorchFunctionMode):
     """Observe whether a network detaches tensors, or ignore that it does.
 
     RT-DETR and similar networks choose queries by the scores of their encoder, and detach
     these from their decoder, in evaluation too: that makes training stable (Zhu et al.
     2020, arXiv 2010.04159, appendix A.4), and hides from a search how the image moves them.
 
-    `detach` does nothing if it is `ignored`; `seen` states whether something with a gradient
+    `detach` does nothing if it is `ignored`; `has_detached` states whether something with a gradient
     was to be detached.
     """
 
     def __init__(self, *, ignored: bool = False) -> None:
         super().__init__()
         self.ignored = ignored
-        self.seen = False
+        self.has_detached = False
 
     def __torch_function__(
         self, function: Any, types: Any, args: Any = (), kwargs: Any = None
     ) -> Any:
         """Call torch's function, or return what was to be detached as it is."""
         if function in DETACHING:
-            self.seen = self.seen or args[0].requires_grad
+            self.has_detached = self.has_detached or args[0].requires_grad
             if self.ignored:
                 return args[0]
         return function(*args, **(kwargs or {}))
 
 
-def checked_images(images: Tensor) -> Tensor:
+def check_images(images: Tensor) -> Tensor:
     """Return images as (N, H, W, 3); InputError for what is not an image in [0, 1]."""
     expected = (
         "images: expected a floating-point tensor (H, W, 3) or (N, H, W, 3) in [0, 1]"
@@ -484,7 +484,7 @@ def checked_images(images: Tensor) -> Tensor:
     return images if images.dim() == 4 else images.unsqueeze(0)
 
 
-def read_by(read: Read, returned: Any, count: int, name: str) -> Any:
+def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
     """Read the output from what a network returned for `count` images.
 
     Raises:
@@ -493,17 +493,17 @@ def read_by(read: Read, returned: Any, count: int, name: str) -> Any:
     try:
         output = read(returned, count)
     except ValueError as error:
-        advice = _no_scores(returned)
+        advice = _advise_on_missing_scores(returned)
         if not advice:
-            likely_task = _task_of(returned)
+            likely_task = _guess_task(returned)
             task = getattr(getattr(read, "__self__", None), "name", None)
             # Actions look like rows of scores.
             if likely_task and task not in (likely_task, "command"):
-                advice = _other_task(likely_task)
+                advice = _advise_other_task(likely_task)
             else:
                 advice = "wrap the network, or ask for another task"
         raise ModelError(
-            f"model {name}: {error}, got {described(returned)}; {advice}"
+            f"model {name}: {error}, got {describe_output(returned)}; {advice}"
         ) from None
     if len(output) != count:
         raise ModelError(
@@ -514,21 +514,21 @@ def read_by(read: Read, returned: Any, count: int, name: str) -> Any:
     return output
 
 
-def described(returned: Any) -> str:
+def describe_output(returned: Any) -> str:
     """Describe an output of a network by its type, or the shape of a tensor."""
     if isinstance(returned, Tensor):
         return f"one of shape {tuple(returned.shape)}"
     return type(returned).__name__
 
 
-def joined(outputs: Sequence[Any]) -> Any:
+def join_outputs(outputs: Sequence[Any]) -> Any:
     """Concatenate the outputs of several batches: tensors (N, ...), or lists."""
     if isinstance(outputs[0], Tensor):
         return torch.cat(list(outputs))
     return list(chain.from_iterable(outputs))
 
 
-def each_tensor(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
+def map_tensors(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
     """Apply a function to every tensor in an output, in plain dicts and lists.
 
     torch's trees do not know subclasses of these that are not registered, such as a
@@ -537,13 +537,13 @@ def each_tensor(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
     if isinstance(output, Tensor):
         return function(output)
     if isinstance(output, Mapping):
-        return {name: each_tensor(part, function) for name, part in output.items()}
+        return {name: map_tensors(part, function) for name, part in output.items()}
     if isinstance(output, (list, tuple)):
-        return [each_tensor(part, function) for part in output]
+        return [map_tensors(part, function) for part in output]
     return output
 
 
-def tensors_in(output: Any) -> list[Tensor]:
+def list_tensors(output: Any) -> list[Tensor]:
     """Return the tensors in an output, in their order."""
     tensors: list[Tensor] = []
 
@@ -551,11 +551,11 @@ def tensors_in(output: Any) -> list[Tensor]:
         tensors.append(tensor)
         return tensor
 
-    each_tensor(output, collect)
+    map_tensors(output, collect)
     return tensors
 
 
-def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor:
+def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tensor:
     """Return the logits (count, classes) float32 in what a network returned.
 
     Accepted are a tensor, an object with a tensor `logits`, a mapping with a tensor
@@ -572,20 +572,20 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
         if output.requires_grad:
             mend_batch_norms(output)
         return output.float()
-    tensor = _tensor_in(output)
+    tensor = _find_logits(output)
     expected = (
         f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"
     )
-    advice = _no_scores(output)
+    advice = _advise_on_missing_scores(output)
     if advice:
-        got = described(output if tensor is None else tensor)
+        got = describe_output(output if tensor is None else tensor)
         raise ModelError(f"{expected}, got {got}; {advice}")
-    likely_task = _task_of(output)
+    likely_task = _guess_task(output)
     is_map = tensor is not None and tensor.dim() == 4
     has_other_task = likely_task in ("detection", "segmentation", "depth", "similarity")
     if likely_task and has_other_task and not is_map:
         raise ModelError(
-            f"{expected}, got {described(output)}; {_other_task(likely_task)}"
+            f"{expected}, got {describe_output(output)}; {_advise_other_task(likely_task)}"
         )
     if tensor is None:
         raise ModelError(
@@ -599,7 +599,7 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
         or shape[1] < 2
         or (classes is not None and shape[1] != classes)
     ):
-        raise ModelError(f"{expected}, got {shape}; {_advice(shape)}")
+        raise ModelError(f"{expected}, got {shape}; {_advise_on_shape(shape)}")
     if not tensor.is_floating_point():
         raise ModelError(
             f"{expected} and floating type, got {tensor.dtype}; return "
@@ -628,7 +628,7 @@ def mend_batch_norms(output: Any) -> None:
         )
         return strided.copy_(gradient), *rest
 
-    pending: list[Any] = [tensor.grad_fn for tensor in tensors_in(output)]
+    pending: list[Any] = [tensor.grad_fn for tensor in list_tensors(output)]
     visited = {None}
     while pending:
         node = pending.pop()
@@ -641,7 +641,7 @@ def mend_batch_norms(output: Any) -> None:
             node.register_prehook(partial(with_strides, strides))
 
 
-def _tensor_in(output: Any) -> Tensor | None:
+def _find_logits(output: Any) -> Tensor | None:
     """Return the tensor of logits in an output; None if there is none."""
     if isinstance(output, Mapping):
         output = output.get("logits")
@@ -652,14 +652,14 @@ def _tensor_in(output: Any) -> Tensor | None:
     return output if isinstance(output, Tensor) else None
 
 
-def _scores_in(returned: Any) -> Any:
+def _find_scores(returned: Any) -> Any:
     """Return the scores in an output, of images or of pixels; None if there are none."""
     if isinstance(returned, Mapping) and "out" in returned:
         return returned["out"]
-    return _tensor_in(returned)
+    return _find_logits(returned)
 
 
-def _no_scores(returned: Any) -> str:
+def _advise_on_missing_scores(returned: Any) -> str:
     """Return what to do about an output that has losses or class indices instead of
     scores; "" for any other output.
     """
@@ -672,7 +672,7 @@ def _no_scores(returned: Any) -> str:
     # The first element of a list may be the labels of boxes.
     if isinstance(returned, (list, tuple)):
         return ""
-    tensor = _scores_in(returned)
+    tensor = _find_scores(returned)
     if tensor is None or tensor.is_floating_point() or tensor.ndim not in (1, 3):
         return ""
     return (
@@ -681,7 +681,7 @@ def _no_scores(returned: Any) -> str:
     )
 
 
-def _task_of(returned: Any) -> str | None:
+def _guess_task(returned: Any) -> str | None:
     """Return the task whose networks return such an output; None if there is none."""
     is_sequence = isinstance(returned, (tuple, list))
     first = returned[0] if is_sequence and returned else returned
@@ -702,22 +702,22 @@ def _task_of(returned: Any) -> str | None:
         maps = [x for x in returned if isinstance(x, Tensor) and x.ndim == 4]
         if len({feature_map.shape[2:] for feature_map in maps}) > 1:
             return None  # feature maps of several sizes
-    tensor = _scores_in(returned)
+    tensor = _find_scores(returned)
     if not isinstance(tensor, Tensor):
         return None
     return {2: "classification", 4: "segmentation"}.get(tensor.dim())
 
 
-def _other_task(name: str) -> str:
+def _advise_other_task(name: str) -> str:
     """Return the advice to use another task."""
-    return f"{GIVEN_BY[name]}: use `task={name}`"
+    return f"{OUTPUTS_BY_TASK[name]}: use `task={name}`"
 
 
-def _advice(shape: tuple[int, ...]) -> str:
+def _advise_on_shape(shape: tuple[int, ...]) -> str:
     """Return what to do about an output whose shape is not that of logits."""
     if len(shape) == 4:
         return (
-            f"{_other_task('segmentation')}. If these are a classifier's feature "
+            f"{_advise_other_task('segmentation')}. If these are a classifier's feature "
             "maps, wrap the network to pool them"
         )
     if len(shape) > 2:

@@ -17,14 +17,14 @@ from torch import Tensor, nn
 from advsearch.errors import ModelError
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
-from advsearch.models.labels import LabelsOrigin, fitting_labels
+from advsearch.models.labels import LabelsOrigin, fit_labels
 from advsearch.models.model import (
     PROGRAMS,
-    Detaching,
+    DetachMode,
     Model,
-    logits_of,
-    read_by,
-    tensors_in,
+    list_tensors,
+    read_logits,
+    read_output,
     warn,
 )
 from advsearch.trust.foreign_code import TookTooLong, first_line, within
@@ -36,11 +36,11 @@ PROBABILITY_TOLERANCE = 1e-3
 PERCENT_TOLERANCE = 5e-3
 # Magnitude of colors outside [0, 1] that show whether scores stay in [0, 1] whatever
 # the image is.
-FAR = 1000.0
+FAR_COLOR = 1000.0
 # Relative difference of outputs that count as the same; kernels differ by 1e-6.
 REPEAT_TOLERANCE = 1e-3
 
-ROUNDING = 4.0
+ROUNDING_STEPS = 4.0
 """Minimum change of an image, and tolerance of outputs, in units of the machine epsilon
 of the network's dtype: bfloat16 distinguishes 0.50 from 0.51 and no less.
 """
@@ -48,21 +48,21 @@ of the network's dtype: bfloat16 distinguishes 0.50 from 0.51 and no less.
 # Change of each value of an image, in [0, 1], along the gradient that is checked.
 STEP = 1e-3
 
-MASKED = 0.9
+MAX_GRADIENT_ERROR = 0.9
 """Maximum relative error of what the gradient predicts: a wrong sign is an error of 2, a
 step function one of 1; kinks of ordinary networks stay below a half.
 """
 
-AGREES = 0.5
+MAX_ATTACHED_ERROR = 0.5
 """Maximum relative error of what a gradient predicts that replaces the network's own."""
 
-HARDLY = 0.15
+MIN_RELATIVE_CHANGE = 0.15
 """Median relative change of an output between unlike images below which it hardly
 follows them. Measured: 0.50 to 1.04 for five trained networks, and 0.006 to 0.10 for
 the same with a 255th of their range.
 """
 
-MOST_GROWTH = 2.0
+MAX_GROWTH = 2.0
 """Maximum factor by which outputs may grow with the right range of colors: 0.98 to 1.22
 for the same five networks. Outputs of untrained networks grow with their input.
 """
@@ -70,10 +70,10 @@ for the same five networks. Outputs of untrained networks grow with their input.
 EIGHT_BIT = (0.0, 255.0)  # the other range of colors that networks are made for
 
 # Minimum relative change of outputs that is evaluated: less may be rounding.
-SMALLEST = 1e-5
+MIN_CHANGE = 1e-5
 
 # Maximum number of pixels in the smallest batch that a network takes: 800 MB.
-LARGEST = 1 << 26
+MAX_PIXELS = 1 << 26
 
 
 def probe(
@@ -92,7 +92,7 @@ def probe(
         labels_origin: where they come from, for messages.
 
     Raises:
-        ModelError: it takes more than `LARGEST`, cannot be run on such an image,
+        ModelError: it takes more than `MAX_PIXELS`, cannot be run on such an image,
             returns something other than logits, or with NaN or infinity.
         InputError: the number of labels is not the number of classes.
 
@@ -110,13 +110,13 @@ def probe(
     _check_finite(model, rows)
     returns_logits = model.read is None
     if returns_logits:
-        names = fitting_labels(rows.shape[1], labels, labels_origin, model.name)
+        names = fit_labels(rows.shape[1], labels, labels_origin, model.name)
         probabilities = _find_probabilities(model, rows)
     else:
         names = labels or ()
         probabilities = False
         _warn_of_pixel_probabilities(model, noise)
-    repeatable = _same(model, rows[:1], repeated_rows)
+    repeatable = _are_equal(model, rows[:1], repeated_rows)
     if repeatable and returns_logits and not probabilities:
         _warn_of_odd_scores(model, rows)
     if repeatable:
@@ -129,11 +129,11 @@ def probe(
             "for single draws only"
         )
     return dataclasses.replace(
-        _with_gradient(model, noise, repeatable),
+        _probe_gradient(model, noise, repeatable),
         labels=names,
         named=labels is not None,
         probabilities=probabilities,
-        batch_limits=_batch_limits(
+        batch_limits=_find_batch_limits(
             model, torch.cat([gray, noise]), rows if repeatable else None
         ),
     )
@@ -143,11 +143,11 @@ def _check_batch_size(model: Model) -> None:
     """Raise ModelError if the smallest batch of a model has too many pixels."""
     height, width = model.input_size
     count = max(model.batch_limits[0], 1)
-    if count * height * width > scaled(LARGEST):
+    if count * height * width > scaled(MAX_PIXELS):
         raise ModelError(
             f"model {model.name}: takes {count:,} images of {height:,} x {width:,} "
             "pixels at once, expected at most "
-            f"{scaled(LARGEST):,} pixels; if you trust it, {FACTOR}=10 in the "
+            f"{scaled(MAX_PIXELS):,} pixels; if you trust it, {FACTOR}=10 in the "
             "environment allows ten times "
             "as many"
         )
@@ -168,8 +168,8 @@ def _check_finite(model: Model, rows: Tensor) -> None:
 
 def _find_probabilities(model: Model, rows: Tensor) -> bool:
     """Return whether rows (N, classes) are probabilities or percentages, and warn."""
-    are_percentages = _probabilities(rows / 100.0, PERCENT_TOLERANCE)
-    if not are_percentages and not _probabilities(rows):
+    are_percentages = _are_probabilities(rows / 100.0, PERCENT_TOLERANCE)
+    if not are_percentages and not _are_probabilities(rows):
         return False
     kind = "percentages that sum to 100" if are_percentages else "probabilities"
     warn(
@@ -184,10 +184,10 @@ def _find_probabilities(model: Model, rows: Tensor) -> bool:
 def _warn_of_pixel_probabilities(model: Model, images: Tensor) -> None:
     """Warn if a segmenter returns probabilities for the pixels of images."""
     with torch.no_grad():
-        output: Any = _read(model, images)
+        output: Any = _run_and_read(model, images)
     # (N, classes, h, w)
     is_map = isinstance(output, Tensor) and output.ndim == 4 and output.shape[1] > 1
-    if is_map and _probabilities(output.movedim(1, -1).flatten(0, 2)):
+    if is_map and _are_probabilities(output.movedim(1, -1).flatten(0, 2)):
         warn(
             f"model {model.name} returns probabilities for each pixel: margins are "
             "differences of these and no "
@@ -198,7 +198,7 @@ def _warn_of_pixel_probabilities(model: Model, images: Tensor) -> None:
 
 def _warn_of_odd_scores(model: Model, rows: Tensor) -> None:
     """Warn if rows (N, classes) are scores that are neither logits nor probabilities."""
-    kind = _odd_scores(model, rows)
+    kind = _describe_odd_scores(model, rows)
     if kind:
         warn(
             f"model {model.name} returns {kind}. They are taken for logits: the "
@@ -216,40 +216,42 @@ def _run(model: Model, images: Tensor) -> Tensor:
     sum, and the sum of their absolute values.
     """
     if model.read is None:
-        returned, count = _returned(model, images)
-        return logits_of(returned, count, None, model.name)[: len(images)].cpu()
+        returned, count = _run_network(model, images)
+        return read_logits(returned, count, None, model.name)[: len(images)].cpu()
     rows = []
-    for output in _read(model, images):
+    for output in _run_and_read(model, images):
         tensors = [torch.zeros(0, device="cpu")]
-        tensors += [tensor.float().flatten().cpu() for tensor in tensors_in(output)]
+        tensors += [tensor.float().flatten().cpu() for tensor in list_tensors(output)]
         values = torch.cat(tensors)
         size = torch.tensor(float(len(values))).to(values)
         rows.append(torch.stack([size, values.sum(), values.abs().sum()]))
     return torch.stack(rows)
 
 
-def _read(model: Model, images: Tensor) -> Any:
+def _run_and_read(model: Model, images: Tensor) -> Any:
     """Run a network that does not return logits on images (N, H, W, 3), and read its output."""
     assert model.read is not None
-    return read_by(model.read, *_returned(model, images), model.name)[: len(images)]
+    return read_output(model.read, *_run_network(model, images), model.name)[
+        : len(images)
+    ]
 
 
-def _returned(model: Model, images: Tensor) -> tuple[Any, int]:
+def _run_network(model: Model, images: Tensor) -> tuple[Any, int]:
     """Return what the network returns for images (N, H, W, 3), and the size of its batch, which
     may be larger.
     """
-    x = model.prepared(images)
+    x = model.prepare(images)
     with torch.set_grad_enabled(torch.is_grad_enabled()):
-        return _guarded(model, lambda: model.ask(x, raw=True)), len(x)
+        return _call_guarded(model, lambda: model.run_network(x, raw=True)), len(x)
 
 
-def _guarded(model: Model, call: Callable[[], Any]) -> Any:
+def _call_guarded(model: Model, call: Callable[[], Any]) -> Any:
     """Call a foreign network; whatever it raises becomes a ModelError with advice.
 
     A program has a deadline, for nothing else ends it; the user's own code is ended by
     Ctrl-C.
     """
-    network = _inner(model.module)
+    network = _unwrap(model.module)
     try:
         stop = getattr(network, "stop", None)
         return within(call, stop) if stop or isinstance(network, PROGRAMS) else call()
@@ -259,7 +261,7 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
         (height, width) = model.input_size
         preprocessing = model.preprocessing
         made_for = ""
-        why = _unlike_pictures(network, str(error))
+        why = _describe_other_inputs(network, str(error))
         if isinstance(model.module, WithState) and model.module.state:
             sizes = ", ".join(
                 f"{name} (N, {len(numbers)})"
@@ -281,18 +283,25 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
         ) from error
 
 
-def _inner(network: Any) -> Any:
+def _unwrap(network: Any) -> Any:
     """Return the network inside the adapters that make it one of images alone."""
     while isinstance(network, (AllAtOnce, WithState, WithImageSize, EightBitInput)):
         network = network.network
     return network
 
 
-TRUTHS = {"target", "targets", "label", "labels", "annotations", "ground_truth"}
+LABEL_ARGUMENTS = {
+    "target",
+    "targets",
+    "label",
+    "labels",
+    "annotations",
+    "ground_truth",
+}
 """Names of the right labels among the arguments of a network in training form."""
 
 
-def _unlike_pictures(network: object, error: str) -> str:
+def _describe_other_inputs(network: object, error: str) -> str:
     """Describe what a network that raised an error needs other than images; "" if that
     is not known.
     """
@@ -308,7 +317,7 @@ def _unlike_pictures(network: object, error: str) -> str:
         if parameter.kind not in variadic
         and parameter.default is inspect.Parameter.empty
     }
-    named_in_error = TRUTHS & set(re.findall(r"\w+", error))
+    named_in_error = LABEL_ARGUMENTS & set(re.findall(r"\w+", error))
     missing = [
         parameter.name
         for parameter in parameters
@@ -328,13 +337,13 @@ def _unlike_pictures(network: object, error: str) -> str:
     return ""
 
 
-def _probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bool:
+def _are_probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bool:
     """Whether rows (N, classes) are non-negative and sum to 1."""
     sums = rows.sum(dim=1)
     return bool((rows >= 0).all()) and bool(((sums - 1).abs() < tolerance).all())
 
 
-def _odd_scores(model: Model, rows: Tensor) -> str:
+def _describe_odd_scores(model: Model, rows: Tensor) -> str:
     """Describe rows of scores (N, classes) that are neither logits nor probabilities; "" for
     others.
 
@@ -345,7 +354,9 @@ def _odd_scores(model: Model, rows: Tensor) -> str:
     if least >= 0.0 and float(rows.max()) <= 1.0:
         with torch.no_grad():
             height, width = model.input_size
-            far = torch.linspace(0.0, FAR, 3 * height * width).reshape(height, width, 3)
+            far = torch.linspace(0.0, FAR_COLOR, 3 * height * width).reshape(
+                height, width, 3
+            )
             rows = torch.cat([rows, _run(model, torch.zeros_like(far)[None])])
             with suppress(ModelError):  # it may refuse such colours
                 rows = torch.cat([rows, _run(model, torch.stack([far, -far]))])
@@ -382,33 +393,37 @@ def _check_range(model: Model, images: Tensor) -> None:
             ("value_range", (0.0, 1.0)),
         )
     )
-    is_program = isinstance(_inner(model.module), PROGRAMS) or hasattr(
-        _inner(model.module), "stop"
+    is_program = isinstance(_unwrap(model.module), PROGRAMS) or hasattr(
+        _unwrap(model.module), "stop"
     )
     if is_declared or (model.read is not None and not is_program):
         return
-    narrow = _numbers_of(model, images)
-    if narrow is None or _relative_change(narrow) >= HARDLY:
+    narrow = _collect_numbers(model, images)
+    if narrow is None or _compute_relative_change(narrow) >= MIN_RELATIVE_CHANGE:
         return
     wide_model = dataclasses.replace(
         model, preprocessing=dataclasses.replace(preprocessing, value_range=EIGHT_BIT)
     )
-    wide = _numbers_of(wide_model, images)
-    if wide is None or wide.shape != narrow.shape or _relative_change(wide) < HARDLY:
+    wide = _collect_numbers(wide_model, images)
+    if (
+        wide is None
+        or wide.shape != narrow.shape
+        or _compute_relative_change(wide) < MIN_RELATIVE_CHANGE
+    ):
         return
     growth = float(wide.abs().amax(dim=0).mean() / narrow.abs().amax(dim=0).mean())
-    if 1.0 / MOST_GROWTH < growth < MOST_GROWTH:
+    if 1.0 / MAX_GROWTH < growth < MAX_GROWTH:
         warn(
             f"outputs of model {model.name} hardly follow the picture: they differ by "
-            f"{_relative_change(narrow):.1%} "
+            f"{_compute_relative_change(narrow):.1%} "
             "between a black, a white and a random one, and by "
-            f"{_relative_change(wide):.0%} if colors go from 0 to "
+            f"{_compute_relative_change(wide):.0%} if colors go from 0 to "
             "255. If it is made for these, give `value_range=0,255`"
         )
 
 
 @torch.no_grad()
-def _numbers_of(model: Model, images: Tensor) -> Tensor | None:
+def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
     """Return the numbers (K, n) that a network returns for images (K, H, W, 3), one by one.
 
     Scores in [0, 1] become logits, which do not saturate. None if there are no numbers, they
@@ -417,12 +432,12 @@ def _numbers_of(model: Model, images: Tensor) -> Tensor | None:
     rows = []
     for image in images:
         try:
-            returned, _ = _returned(model, image[None])
+            returned, _ = _run_network(model, image[None])
         except ModelError:  # it may refuse such colors
             return None
         numbers = [
             tensor.float().flatten().cpu()
-            for tensor in tensors_in(returned)
+            for tensor in list_tensors(returned)
             if tensor.is_floating_point()
         ]
         rows.append(torch.cat([torch.zeros(0, device="cpu"), *numbers]))
@@ -435,21 +450,23 @@ def _numbers_of(model: Model, images: Tensor) -> Tensor | None:
     return torch.logit(outputs, eps=1e-6) if is_score else outputs
 
 
-def _relative_change(outputs: Tensor) -> float:
+def _compute_relative_change(outputs: Tensor) -> float:
     """Return the median relative change of the numbers of outputs (K, n)."""
     change = outputs.amax(dim=0) - outputs.amin(dim=0)
     size = outputs.abs().amax(dim=0).clamp_min(torch.finfo(torch.float32).tiny)
     return float((change / size).median())
 
 
-def _same(model: Model, rows: Tensor, repeated_rows: Tensor) -> bool:
+def _are_equal(model: Model, rows: Tensor, repeated_rows: Tensor) -> bool:
     """Whether outputs are equal up to the tolerance of the network's dtype."""
-    tolerance = max(REPEAT_TOLERANCE, ROUNDING * torch.finfo(model.dtype).eps)
+    tolerance = max(REPEAT_TOLERANCE, ROUNDING_STEPS * torch.finfo(model.dtype).eps)
     difference = (rows - repeated_rows).abs().amax()
     return bool(difference <= tolerance * rows.abs().amax().clamp_min(1e-6))
 
 
-def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int, int]:
+def _find_batch_limits(
+    model: Model, pair: Tensor, rows: Tensor | None
+) -> tuple[int, int]:
     """Return the minimum and maximum batch size, from a batch of two images.
 
     Args:
@@ -470,7 +487,7 @@ def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int,
             batch_rows = _run(model, pair)
     except ModelError:
         return 1, 1
-    if rows is not None and not _same(model, rows, batch_rows):
+    if rows is not None and not _are_equal(model, rows, batch_rows):
         warn(
             f"model {model.name} sees an image differently in a batch: was it exported "
             "in training mode? "
@@ -479,16 +496,16 @@ def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int,
     return min_batch, max_batch
 
 
-def _with_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
+def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     """Return a model with `differentiable` and `attached` set.
 
     Warns if no gradient reaches the image, or outputs do not follow it.
     """
     reason = "it is zero everywhere"
     try:
-        with Detaching() as detaching:
+        with DetachMode() as detaching:
             try:
-                rows, gradient = _slope(model, images)
+                rows, gradient = _compute_gradient(model, images)
             except RuntimeError as error:
                 # What the network detaches may be all that has a gradient.
                 if not (repeatable and detaching.seen):
@@ -534,21 +551,23 @@ def _try_attached(
     attached = dataclasses.replace(model, attached=True)
     # It may detach what must have no gradient, such as for numpy.
     with suppress(RuntimeError, ModelError):
-        attached_gradient = _slope(attached, images)[1]
+        attached_gradient = _compute_gradient(attached, images)[1]
         for step_size in (STEP, STEP / 8.0):
-            step_size = max(step_size, ROUNDING * torch.finfo(model.dtype).eps)
+            step_size = max(step_size, ROUNDING_STEPS * torch.finfo(model.dtype).eps)
             step = step_size * (attached_gradient - gradient).sign()
-            change, (attached_change, own_change), *_ = _moved(
+            change, (attached_change, own_change), *_ = _measure_change(
                 model, images, step, attached_gradient, gradient
             )
-            max_error = min(abs(change - own_change), AGREES * abs(attached_change))
+            max_error = min(
+                abs(change - own_change), MAX_ATTACHED_ERROR * abs(attached_change)
+            )
             if abs(change - attached_change) < max_error:
                 return attached, attached_gradient
     return model, gradient
 
 
-def _slope(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows of `_run` for images, and the gradient of their `_told` value.
+def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the rows of `_run` for images, and the gradient of their `_compute_checked_value` value.
 
     The gradient is zero if nothing is detected.
     """
@@ -557,19 +576,19 @@ def _slope(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
         rows = _run(model, leaf)
         if model.read is not None and not bool(rows[:, 0].any()):
             return rows, torch.zeros_like(images)
-        return rows, torch.autograd.grad(_told(rows), leaf)[0]
+        return rows, torch.autograd.grad(_compute_checked_value(rows), leaf)[0]
 
 
-def _told(rows: Tensor) -> Tensor:
+def _compute_checked_value(rows: Tensor) -> Tensor:
     """Return a weighted sum of what `_run` returns, whose gradient is checked."""
     return (rows * torch.linspace(-1.0, 1.0, rows.shape[1])).sum()
 
 
 @torch.no_grad()
-def _moved(
+def _measure_change(
     model: Model, images: Tensor, step: Tensor, *gradients: Tensor
 ) -> tuple[float, list[float], list[Tensor], float]:
-    """Measure how the `_told` value changes over a step to both sides of images.
+    """Measure how the `_compute_checked_value` value changes over a step to both sides of images.
 
     Returns:
         The change, what each gradient predicts of it, the images at both ends of the
@@ -577,7 +596,7 @@ def _moved(
     """
     ends = [(images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)]
     outputs = [_run(model, end) for end in ends]
-    change = float(_told(outputs[0] - outputs[1]))
+    change = float(_compute_checked_value(outputs[0] - outputs[1]))
     predicted = [
         float(((ends[0] - ends[1]) * gradient).sum()) for gradient in gradients
     ]
@@ -592,20 +611,25 @@ def _check_gradient(
     """
     # Suppression of boxes may make outputs jump in the larger step only.
     step_sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)
-    min_step = ROUNDING * torch.finfo(model.dtype).eps
+    min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
     if min_step > STEP:
         # A network in half precision is nonlinear in the first, and rounds the second.
         step_sizes = (min_step, min_step / 8.0)
     for step_size in step_sizes:
-        change, (predicted,), ends, total = _moved(
+        change, (predicted,), ends, total = _measure_change(
             model, images, step_size * gradient.sign(), gradient
         )
         if model.read is not None:
-            choices = {_choices(model, image) for image in (images, *ends)}
+            choices = {
+                _collect_discrete_values(model, image) for image in (images, *ends)
+            }
             if len(choices) > 1:
                 return  # outputs that jump cannot be compared with a gradient
         size = max(abs(change), abs(predicted))
-        if size <= SMALLEST * total or abs(change - predicted) <= MASKED * size:
+        if (
+            size <= MIN_CHANGE * total
+            or abs(change - predicted) <= MAX_GRADIENT_ERROR * size
+        ):
             return
     reason = "Steps that round, or a defence that masks gradients?"
     if detached:
@@ -622,18 +646,18 @@ def _check_gradient(
 
 
 @torch.no_grad()
-def _choices(model: Model, images: Tensor) -> str:
+def _collect_discrete_values(model: Model, images: Tensor) -> str:
     """Return the part of an output that no gradient changes, as a string to compare.
 
     That is its shapes, its columns of integers, and its texts. A detector with
     suppression finds other boxes after a small step, and a text continues differently
     after another word.
     """
-    outputs = _read(model, images)
+    outputs = _run_and_read(model, images)
     if isinstance(outputs, Tensor):
         return ""
     choices = list[Any]()
-    for tensor in tensors_in(outputs):
+    for tensor in list_tensors(outputs):
         columns = tensor.flatten(1).T if tensor.ndim > 1 else tensor[None]
         is_integer = (columns == columns.round()).all(dim=1)
         choices.append((tensor.shape, columns[is_integer].tolist()))

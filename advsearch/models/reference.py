@@ -23,7 +23,7 @@ from advsearch.errors import ModelError
 from advsearch.models.labels import LabelsOrigin
 from advsearch.models.model import Model, Preprocessing
 from advsearch.models.probe import probe
-from advsearch.models.source import frozen, load_weights
+from advsearch.models.source import freeze_network, load_weights
 
 INPUT_SIZE = (128, 128)
 STEM = 24
@@ -120,7 +120,7 @@ def build(classes: int, *, dropout: float = 0.1) -> ReferenceNet:
     return ReferenceNet(classes, dropout=dropout).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
-def folded(net: ReferenceNet) -> ReferenceNet:
+def fold_batch_norms(net: ReferenceNet) -> ReferenceNet:
     """Return a copy for inference: evaluation mode, normalisation merged into the
     convolutions, parameters frozen.
     """
@@ -134,7 +134,7 @@ def folded(net: ReferenceNet) -> ReferenceNet:
     return copied.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
-def data_folder() -> Path:
+def get_data_folder() -> Path:
     """Return the folder of the installed package that holds the weights."""
     return Path(str(resources.files("advsearch.models").joinpath("data")))
 
@@ -145,23 +145,23 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
     Raises ModelError: they are missing, damaged, or do not fit this version's network;
     FileFormatError: `weights` is missing or is not safetensors.
     """
-    net, labels = network(folder, weights)
+    net, labels = load_network(folder, weights)
     name = "reference" if weights is None else f"reference@{weights}"
     bare = Model(
-        frozen(folded(net), name), name, (), Preprocessing(INPUT_SIZE),
-        # `folded` has merged its normalisation
-        make_trainable=lambda: network(folder, weights)[0],
+        freeze_network(fold_batch_norms(net), name), name, (), Preprocessing(INPUT_SIZE),
+        # `fold_batch_norms` has merged its normalisation
+        make_trainable=lambda: load_network(folder, weights)[0],
     )  # fmt: skip
     return probe(bare, labels, LabelsOrigin("labels of the reference model"))
 
 
-def network(
+def load_network(
     folder: Path | None = None, weights: Path | None = None
 ) -> tuple[ReferenceNet, tuple[str, ...]]:
     """Return the network with its weights, which can be trained further, and the
     labels; arguments and errors as for `load`.
     """
-    folder = folder or data_folder()
+    folder = folder or get_data_folder()
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
         labels = tuple(str(label) for label in record["labels"])

@@ -36,11 +36,11 @@ from advsearch.errors import (
 from advsearch.models.inputs import takes_image_size
 from advsearch.models.model import (
     CPU,
-    GIVEN_BY,
+    OUTPUTS_BY_TASK,
     PROGRAMS,
     Model,
     Triple,
-    sharing_copy,
+    copy_sharing_weights,
     warn,
 )
 from advsearch.trust.archives import LARGEST
@@ -50,7 +50,7 @@ from advsearch.trust.stored_files import open_regular
 
 # what is asked where nothing else is said
 QUESTION = "What is this? Answer with its name only."
-SIDE = 448
+DEFAULT_SIZE = 448
 """Side in pixels of pictures for networks that take any size: a multiple of 28 and of
 32, the cells of Qwen's.
 """
@@ -87,13 +87,13 @@ class Purpose:
         Raises:
             ModelError: it cannot.
         """
-        if self.task in (*GIVEN_BY, "answer") and self.task not in tasks:
+        if self.task in (*OUTPUTS_BY_TASK, "answer") and self.task not in tasks:
             instead = " or ".join(f"`task={task}`" for task in tasks)
             raise ModelError(
                 f"model {model} {what} and cannot do task {self.task}; use {instead}"
             )
 
-    def in_words(self, model: str, what: str) -> tuple[bool, str | None]:
+    def parse_question(self, model: str, what: str) -> tuple[bool, str | None]:
         """Return whether a network that returns texts answers freely, and the user's question, None
         for the default.
 
@@ -115,7 +115,7 @@ class Purpose:
             )
         return free, prompts[0] if prompts else None
 
-    def named(self, model: str, what: str, task: str) -> tuple[str, ...]:
+    def require_names(self, model: str, what: str, task: str) -> tuple[str, ...]:
         """Return the names for a network without classes of its own.
 
         Raises:
@@ -160,7 +160,7 @@ class Source:
     size_type: torch.dtype | None = None
 
 
-def source_of(module: nn.Module, name: str, **fields: Any) -> Source:
+def make_source(module: nn.Module, name: str, **fields: Any) -> Source:
     """Return a source with the module frozen, its type and device read off its
     parameters; `fields` go to `Source`. Raises ModelError where it has lazy layers that
     have no weights yet.
@@ -186,10 +186,10 @@ def source_of(module: nn.Module, name: str, **fields: Any) -> Source:
         fields = {"dtype": placed.dtype, "device": placed.device, **fields}
     if takes_image_size(module):
         fields = {"size_type": torch.int64, **fields}
-    return Source(frozen(module, name), name, **fields)
+    return Source(freeze_network(module, name), name, **fields)
 
 
-def frozen(module: nn.Module, name: str) -> nn.Module:
+def freeze_network(module: nn.Module, name: str) -> nn.Module:
     """Return the module in evaluation mode, with parameters that collect no gradient.
 
     An ordinary module is copied, except for its weights, which the copy shares: the
@@ -199,7 +199,7 @@ def frozen(module: nn.Module, name: str) -> nn.Module:
     """
     if not isinstance(module, PROGRAMS):
         try:
-            module = sharing_copy(module)
+            module = copy_sharing_weights(module)
         except (
             TypeError,
             AttributeError,
@@ -289,7 +289,7 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
                 if not key.startswith("_") and callable(getattr(value, key))
             ]
             raise UnknownNameError(
-                f"attribute of {module_name}", part, near_names(part, known)
+                f"attribute of {module_name}", part, find_near_names(part, known)
             )
         value = getattr(value, part)
     if not isinstance(value, (nn.Module, Model)):
@@ -318,7 +318,7 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
         )
     if weights is not None:
         load_weights(value, weights, target)
-    return source_of(value, spec)
+    return make_source(value, spec)
 
 
 def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType:
@@ -354,13 +354,13 @@ def _where(error: BaseException) -> str:
     )
 
 
-def near_names(name: str, known: Iterable[str]) -> list[str]:
+def find_near_names(name: str, known: Iterable[str]) -> list[str]:
     """Return at most a dozen names to show, the nearest first."""
     names = sorted(known)
     return difflib.get_close_matches(name, names, n=12, cutoff=0.3) or names[:12]
 
 
-def library(name: str, spec: str, extra: str) -> Any:
+def import_library(name: str, spec: str, extra: str) -> Any:
     """Return an optional library, that an extra of advsearch installs and a model
     needs. Raises ModelError where it is not installed, or cannot be imported.
     """

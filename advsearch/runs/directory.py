@@ -27,7 +27,7 @@ from advsearch.runs import files, store
 from advsearch.runs import summary as summary
 from advsearch.runs.trackers import Tracker, check_tracker
 from advsearch.settings import CONFIG as CONFIG
-from advsearch.settings import HEADER, PythonOnly, settings, shown
+from advsearch.settings import HEADER, PythonOnly, format_value, settings
 from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import (
     LOCK,
@@ -128,7 +128,7 @@ class RunDirectory:
                     _clear(path)
                 try:
                     if config is not None:
-                        write_text(path / CONFIG, config.to_repeat().to_yaml())
+                        write_text(path / CONFIG, config.make_repeatable().to_yaml())
                     made = cls(path, held)
                     undo.callback(made.store.close)
                     if config is not None:
@@ -154,7 +154,7 @@ class RunDirectory:
         check_tracker(log)
         run = cls.create_for(config) if resumed is None else cls.resume(resumed, config)
         if log is not None:
-            run._tracker = Tracker(log, run.path, config.deciding())
+            run._tracker = Tracker(log, run.path, config.get_deciding_settings())
         return run
 
     @classmethod
@@ -162,7 +162,7 @@ class RunDirectory:
         """Make the directory that `config` asks for, with its `run.yaml`; errors as for
         `create`.
         """
-        (place, overwrite), (first, *others) = config.place, config.title
+        (place, overwrite), (first, *others) = config.run_location, config.title_words
         return cls.create(
             place,
             config=config,
@@ -199,13 +199,13 @@ class RunDirectory:
 
     def _note_start(self, config: Config) -> None:
         """Note what decides the numbers of a new run."""
-        if config.only_here:
-            self.store.set_note(ONLY_HERE, json.dumps(config.only_here))
+        if config.python_only_parts:
+            self.store.set_note(ONLY_HERE, json.dumps(config.python_only_parts))
         self.check_unchanged(
             summary.MADE_WITH, summary.made_with(_known_settings(config))
         )
         # last: with it the others are there, too
-        self.check_unchanged(BEGUN_WITH, config.deciding())
+        self.check_unchanged(BEGUN_WITH, config.get_deciding_settings())
 
     def _check_same(self, config: Config) -> None:
         """Refuse settings, versions and files that decide other numbers than those that
@@ -225,7 +225,7 @@ class RunDirectory:
             for name, value in _known_settings(config).items()
             if name not in summary.NOT_READ_AGAIN
         }
-        self.check_unchanged(BEGUN_WITH, config.deciding())
+        self.check_unchanged(BEGUN_WITH, config.get_deciding_settings())
         self.check_unchanged(summary.MADE_WITH, summary.made_with(read_again))
 
     def check_unchanged(self, note: str, facts: Mapping[str, Any]) -> None:
@@ -275,7 +275,7 @@ class RunDirectory:
         """Return the name of a file that settings name and that is another one than
         when a run was made, or None.
         """
-        return summary.changed_file(RunDirectory.read_made_with(run), config.plain())
+        return summary.changed_file(RunDirectory.read_made_with(run), config.to_json())
 
     @staticmethod
     def read_made_with(run: Path) -> dict[str, object]:
@@ -385,7 +385,7 @@ def begun(config: Config) -> Iterator[Path | None]:
     raises before anything was evaluated, nothing is left of it. It is None for a run
     that takes the place of another one, which stays until then.
     """
-    place, overwrite = config.place
+    place, overwrite = config.run_location
     if overwrite and place is not None and is_run(run_path(place)):
         yield None
         return
@@ -549,12 +549,12 @@ def _clear(path: Path) -> None:
 def _known_settings(config: Config) -> dict[str, Any]:
     """Return the settings that the command has, by name, as JSON values."""
     known = {setting.name for setting in settings(type(config))}
-    return {name: value for name, value in config.plain().items() if name in known}
+    return {name: value for name, value in config.to_json().items() if name in known}
 
 
 def _with_value(name: str, value: object) -> str:
     """Return a name with the value that it had, where that is short."""
-    text = shown(value)
+    text = format_value(value)
     return (
         name if value is None or len(text) > LONGEST_VALUE else f"{name} (was {text})"
     )

@@ -22,15 +22,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Floats, Ints, Mesh, Shape
+from advsearch.scene.assets import Float32Array, IntArray, Mesh, Shape
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.geometry import camera_to_world, driving, projected, seated
+from advsearch.scene.geometry import (
+    camera_to_world,
+    compute_car_pose,
+    compute_seated_pose,
+    project_points,
+)
 from advsearch.scene.gradients import Group
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart
 
 # inputs that the renderer applies to radiance
-ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})
+IMAGE_INPUTS = frozenset({"backdrop.color", "camera.exposure"})
 
 
 class MovingMesh:
@@ -42,7 +47,7 @@ class MovingMesh:
         self.normals = torch.from_numpy(mesh.normals.astype(np.float32))
         self.to_world = torch.from_numpy(to_world.astype(np.float32))
 
-    def place(
+    def transform_mesh(
         self, to_world: Tensor | None, offsets: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Return world-space vertices and unit normals, both (V, 3).
@@ -59,7 +64,7 @@ class MovingMesh:
         # The author's normals turn by as much as those that follow from the faces.
         if offsets is not None:
             original = self._original_area_normals.to(device)
-            change = self._area_normals(vertices + offsets) - original
+            change = self._compute_area_normals(vertices + offsets) - original
             vertices = vertices + offsets
             normals = normals + change
         world_vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
@@ -67,7 +72,7 @@ class MovingMesh:
         lengths = world_normals.norm(dim=1, keepdim=True).clamp_min(1e-12)
         return world_vertices, world_normals / lengths
 
-    def _area_normals(self, vertices: Tensor) -> Tensor:
+    def _compute_area_normals(self, vertices: Tensor) -> Tensor:
         """Return area-weighted normals (V, 3).
 
         Vertices that share position and normal share the average, so that creases stay
@@ -85,7 +90,7 @@ class MovingMesh:
 
     @cached_property
     def _original_area_normals(self) -> Tensor:
-        return self._area_normals(self.vertices)
+        return self._compute_area_normals(self.vertices)
 
     @cached_property
     def _shared_groups(self) -> tuple[Tensor, Tensor]:
@@ -100,7 +105,7 @@ class MovingMesh:
         return torch.from_numpy(faces), torch.from_numpy(groups.astype(np.int64))
 
 
-def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
+def pose_mesh(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
     """Return a mesh of a scene with its inputs set: in world space, z up.
 
     The inputs are those of `MitsubaScene` that differ from the base values.
@@ -111,10 +116,12 @@ def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
         for key, value in inputs.items()
         if key.startswith(prefix)
     }
-    base_vertices, base_normals = MovingMesh(part.mesh, part.to_world).place(None, None)
+    base_vertices, base_normals = MovingMesh(part.mesh, part.to_world).transform_mesh(
+        None, None
+    )
 
-    def to_rows(tensor: Tensor) -> Floats:
-        rows: Floats = tensor.reshape(-1, 3).to(torch.float32).numpy()
+    def to_rows(tensor: Tensor) -> Float32Array:
+        rows: Float32Array = tensor.reshape(-1, 3).to(torch.float32).numpy()
         return rows
 
     mesh = replace(
@@ -135,19 +142,19 @@ def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
 
 
 # distance in object sizes to the side, at which an object is less than a pixel wide
-AWAY = 1000.0
+HIDDEN_OFFSET = 1000.0
 
 
 class Assembly:
     """Turn the inputs of a space into those of `MitsubaScene`, for a scene's parts.
 
     Attributes:
-        away: put the object so far away that neither it nor its shadow is in the image.
+        is_object_hidden: put the object so far away that neither it nor its shadow is in the image.
             The bounds of a scene in which this was set once change the last bits of
             every later image: use it for such images alone.
     """
 
-    away = False
+    is_object_hidden = False
 
     def __init__(self, description: SceneDescription) -> None:
         self.meshes = {
@@ -166,10 +173,10 @@ class Assembly:
 
         All are differentiable torch operations.
         """
-        if self.away:
+        if self.is_object_hidden:
             name = f"{OBJECT}.to_world"
             pose = inputs.get(name, self.meshes[OBJECT].to_world).clone()
-            pose[1, 3] += AWAY
+            pose[1, 3] += HIDDEN_OFFSET
             inputs = {**inputs, name: pose}
         parameters = dict(inputs)
         for part in self._carried:  # what carries it may be moved or deformed
@@ -178,7 +185,7 @@ class Assembly:
             to_world = parameters.pop(f"{name}.to_world", None)
             offsets = parameters.pop(f"{name}.offsets", None)
             if to_world is not None or offsets is not None:
-                vertices, normals = mesh.place(to_world, offsets)
+                vertices, normals = mesh.transform_mesh(to_world, offsets)
                 parameters[f"{name}.vertices"] = vertices
                 parameters[f"{name}.normals"] = normals
         if "camera.shift" in parameters:
@@ -188,19 +195,25 @@ class Assembly:
         if "environment.data" in parameters:
             data = parameters.pop("environment.data")
             if self._photograph is not None:
-                parameters["ground.reflectance"] = self._photograph.reflectance(data)
+                parameters["ground.reflectance"] = self._photograph.compute_reflectance(
+                    data
+                )
             parameters["environment.padded"] = torch.cat(
                 [data[:, -1:], data, data[:, :1]], dim=1
             )
         return parameters
 
-    def vertices(self, name: str, assembled: Mapping[str, Tensor]) -> Tensor:
+    def get_vertices(self, name: str, assembled: Mapping[str, Tensor]) -> Tensor:
         """Return the vertices (V, 3) of a mesh in world space.
 
         `assembled` are inputs as a call returns them.
         """
         vertices = assembled.get(f"{name}.vertices")
-        return self.meshes[name].place(None, None)[0] if vertices is None else vertices
+        return (
+            self.meshes[name].transform_mesh(None, None)[0]
+            if vertices is None
+            else vertices
+        )
 
 
 def _move_carried(
@@ -211,21 +224,23 @@ def _move_carried(
     pose = inputs.get(f"{part.carrier}.to_world")
     offsets = inputs.get(f"{part.carrier}.offsets")
     if isinstance(part, LampGlass) and offsets is not None:
-        follows = torch.from_numpy(part.follows).to(offsets.device)
+        follows = torch.from_numpy(part.vertex_of_carrier).to(offsets.device)
         moved_inputs[f"{part.name}.offsets"] = offsets[follows]
     if pose is not None and isinstance(part, BeamLamp):
-        car_pose = driving(pose) if part.carrier == CAMERA else pose
-        pose = seated(car_pose, torch.from_numpy(part.seat).to(pose))
+        car_pose = compute_car_pose(pose) if part.carrier == CAMERA else pose
+        pose = compute_seated_pose(car_pose, torch.from_numpy(part.seat).to(pose))
     if pose is not None:
         moved_inputs[f"{part.name}.to_world"] = pose
     return moved_inputs
 
 
 # from a configuration (d,) to one number, at one seed
-Value = Callable[[Tensor], Tensor]
+ScalarFunction = Callable[[Tensor], Tensor]
 
 
-def central(value: Value, group: Group, u: Tensor, derivative: Tensor) -> None:
+def write_central_differences(
+    value: ScalarFunction, group: Group, u: Tensor, derivative: Tensor
+) -> None:
     """Write the central differences of a function into a derivative.
 
     Args:
@@ -237,14 +252,16 @@ def central(value: Value, group: Group, u: Tensor, derivative: Tensor) -> None:
     for coordinate in range(group.begin, group.begin + group.size):
         step = torch.zeros_like(u)
         step[coordinate] = group.step
-        above, step_up = moved(u, step, group.periodic)
-        below, step_down = moved(u, -step, group.periodic)
+        above, step_up = step_in_box(u, step, group.periodic)
+        below, step_down = step_in_box(u, -step, group.periodic)
         rise = value(above) - value(below)
         run = (step_up - step_down)[coordinate]
         derivative[coordinate] = float(rise) / float(run)
 
 
-def moved(u: Tensor, step: Tensor, periodic: bool | Tensor) -> tuple[Tensor, Tensor]:
+def step_in_box(
+    u: Tensor, step: Tensor, periodic: bool | Tensor
+) -> tuple[Tensor, Tensor]:
     """Return u + step brought back into the box, and the step that was really taken.
 
     Periodic coordinates wrap around, so that they can go the full step.
@@ -256,16 +273,16 @@ def moved(u: Tensor, step: Tensor, periodic: bool | Tensor) -> tuple[Tensor, Ten
     return position, torch.where(is_periodic, step, clipped - u)
 
 
-POINTS = 400  # vertices of a mesh that are followed
+N_VERTICES = 400  # vertices of a mesh that are followed
 NUDGES = (2e-3, 2e-4, 2e-5, 2e-6)
 """Changes of u over which the speed is measured.
 
 The largest is taken that leaves something in the frame.
 """
 # directions in which the environment is followed: some hundred of them lie in a frame
-DIRECTIONS = 4000
-EDGE = 25  # points that are followed along each side of the ground plane
-FAR = 1e4  # distance of the environment's points, in scene units
+N_DIRECTIONS = 4000
+N_EDGE_POINTS = 25  # points that are followed along each side of the ground plane
+ENVIRONMENT_DISTANCE = 1e4  # distance of the environment's points, in scene units
 
 
 class Motion:
@@ -295,20 +312,20 @@ class Motion:
         self._camera = torch.from_numpy(pose).double()
         if description.photograph is None:
             self._ground = description.number("ground.size") / 2.0
-            self._edge = _square_edge(self._ground)
+            self._edge = _sample_square_edge(self._ground)
         else:
             floor = description.photograph.mesh.vertices
             self._ground = float(floor.max())
             self._edge = torch.from_numpy(floor).double()
         # Points of the environment; none if nothing shows them.
         hidden = description.backdrop or description.environment is None
-        self._far = _sphere_directions(0 if hidden else DIRECTIONS) * FAR
+        self._far = _sample_sphere(0 if hidden else N_DIRECTIONS) * ENVIRONMENT_DISTANCE
         self._picks = {
-            name: torch.from_numpy(_spread_indices(len(mesh.vertices), POINTS))
+            name: torch.from_numpy(_spread_indices(len(mesh.vertices), N_VERTICES))
             for name, mesh in assembly.meshes.items()
         }
 
-    def pixels(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def project_points(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return where the followed points lie in the image.
 
         Returns:
@@ -319,12 +336,12 @@ class Motion:
         if "camera.to_world" in inputs:
             camera = inputs["camera.to_world"].double()
         points = [
-            self._assembly.vertices(name, inputs)[picks].double()
+            self._assembly.get_vertices(name, inputs)[picks].double()
             for name, picks in self._picks.items()
         ]
         eye = camera[:3, 3]
         relative = (torch.cat([*points, self._edge, self._far]) - eye) @ camera[:3, :3]
-        positions, is_visible = projected(
+        positions, is_visible = project_points(
             self._description, inputs, relative, self._resolution
         )
         n_near = len(is_visible) - len(self._far)
@@ -341,7 +358,7 @@ class Motion:
         on_ground = (hit[:, :2].abs() <= self._ground).all(dim=1)
         return (directions[:, 2] < 0.0) & bool(eye[2] > 0.0) & on_ground
 
-    def speeds(
+    def measure_speeds(
         self,
         inputs: Callable[[Tensor], Mapping[str, Tensor]],
         u: Tensor,
@@ -358,13 +375,13 @@ class Motion:
         """
         speeds = torch.zeros(len(u))
         with torch.no_grad():
-            positions, is_visible = self.pixels(inputs(u))
+            positions, is_visible = self.project_points(inputs(u))
             for coordinate in coordinates:
                 for size in NUDGES:
                     nudged = u.clone()
                     sign = 1.0 if float(u[coordinate]) + size <= 1.0 else -1.0
                     nudged[coordinate] += sign * size
-                    new_positions, still_visible = self.pixels(inputs(nudged))
+                    new_positions, still_visible = self.project_points(inputs(nudged))
                     shifts = (new_positions - positions)[is_visible & still_visible]
                     distances = shifts.norm(dim=1)
                     # If nothing moves, all that does may have left the frame.
@@ -374,9 +391,9 @@ class Motion:
         return speeds
 
 
-def _square_edge(half_width: float) -> Tensor:
+def _sample_square_edge(half_width: float) -> Tensor:
     """Return points (n, 3) along the edge of a level square at height 0."""
-    count = EDGE if half_width > 0.0 else 0
+    count = N_EDGE_POINTS if half_width > 0.0 else 0
     along = torch.linspace(-half_width, half_width, count, dtype=torch.float64)
     side = torch.full_like(along, half_width)
     zero = torch.zeros_like(along)
@@ -384,15 +401,15 @@ def _square_edge(half_width: float) -> Tensor:
     return torch.cat([torch.stack([x, y, zero], dim=1) for x, y in sides])
 
 
-def _sphere_directions(count: int) -> Tensor:
+def _sample_sphere(count: int) -> Tensor:
     """Return (count, 3) directions evenly spread over the sphere (Fibonacci spiral)."""
     index = torch.arange(count, dtype=torch.float64)
-    z = 1.0 - (2.0 * index + 1.0) / DIRECTIONS
+    z = 1.0 - (2.0 * index + 1.0) / N_DIRECTIONS
     azimuth = index * torch.pi * (3.0 - 5.0**0.5)
     radius = (1.0 - z**2).sqrt()
     return torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=1)
 
 
-def _spread_indices(count: int, limit: int) -> Ints:
+def _spread_indices(count: int, limit: int) -> IntArray:
     """Return at most `limit` indices evenly spread over [0, count)."""
     return np.linspace(0, count - 1, min(limit, count)).astype(int)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import InputError
-from advsearch.options import rounded
+from advsearch.options import format_rounded
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from advsearch.options import Value
     from advsearch.scene.settings import Parameter
 
-Floats = npt.NDArray[np.float32]
-Doubles = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+Float32Array = npt.NDArray[np.float32]
+Float64Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 # how far texture coordinates of a texture that does not repeat may lie beyond its edges
-SLACK = 1e-3
+UV_TOLERANCE = 1e-3
 
 
 class MeshRig(Protocol):
@@ -53,7 +53,7 @@ class MeshRig(Protocol):
         Differentiable.
         """
 
-    def measured(
+    def get_measurements(
         self, values: Mapping[str, Tensor], clip: str | None = None
     ) -> Mapping[str, Value]:
         """Return what else is worth storing, by name."""
@@ -67,24 +67,26 @@ class Mesh:
     1], but for meshes of Mitsuba scenes, whose textures may go on beyond their edges.
     """
 
-    vertices: Floats  # (V, 3) positions, z up, in the author's units
+    vertices: Float32Array  # (V, 3) positions, z up, in the author's units
     # (F, 3) vertices, counter-clockwise seen from outside
     faces: npt.NDArray[np.uint32]
-    normals: Floats  # (V, 3) unit shading normals, pointing outwards
-    uvs: Floats  # (V, 2)
+    normals: Float32Array  # (V, 3) unit shading normals, pointing outwards
+    uvs: Float32Array  # (V, 2)
     # further numbers of Mitsuba's meshes, (V, n) or (F, n), by its names, which begin
     # with "vertex_" or "face_"
-    attributes: Mapping[str, Floats] = field(default_factory=dict)
+    attributes: Mapping[str, Float32Array] = field(default_factory=dict)
     # the faces (N,) of each material that its file names, by that name; each face is in
     # one at most
-    materials: Mapping[str, Ints] = field(default_factory=dict)
+    materials: Mapping[str, IntArray] = field(default_factory=dict)
     # what moves its vertices, for the control `body`; None for what has no joints
     rig: MeshRig | None = None
 
     @property
     def repeats(self) -> bool:
         """Whether its texture coordinates leave [0, 1], so that a texture repeats."""
-        return not (self.uvs.min() >= -SLACK and self.uvs.max() <= 1.0 + SLACK)
+        return not (
+            self.uvs.min() >= -UV_TOLERANCE and self.uvs.max() <= 1.0 + UV_TOLERANCE
+        )
 
     def __post_init__(self) -> None:
         """Check shapes and values. Raises InputError."""
@@ -143,13 +145,13 @@ class Material:
 class FileAxis:
     """An axis of a mesh file that is taken for up, or for the front."""
 
-    axis: str  # up: "y" or "z"; front: one of `FACINGS`
+    axis: str  # up: "y" or "z"; front: one of `FRONT_AXES`
     # why, and what to do if it is wrong; empty where the user said it, or the format
     # which is up
     reason: str = ""
 
 
-FACINGS = ("+x", "-x", "+y", "-y", "+z", "-z")
+FRONT_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Axes of a mesh file along which the front of what is in it may face."""
 
 
@@ -164,7 +166,7 @@ class Shape:
 
     name: str  # short, used in paths
     mesh: Mesh
-    base_color: Floats  # (H, W, 3) display-referred sRGB in [0, 1]
+    base_color: Float32Array  # (H, W, 3) display-referred sRGB in [0, 1]
     # the remaining surface parameters
     material: Material = field(default_factory=Material)
     # the class it belongs to in the reference model, or None when unknown
@@ -174,10 +176,10 @@ class Shape:
     surface: Mapping[str, object] | None = None
     # (H, W) in [0, 1], the share of light that does not pass through; None where it is
     # 1
-    opacity: Floats | None = None
-    normal_map: Floats | None = None  # (H, W, 3)
+    opacity: Float32Array | None = None
+    normal_map: Float32Array | None = None  # (H, W, 3)
     # (H, W, 3) linear radiance of its faces' front; (1, 1, 3): the same everywhere
-    emission: Floats | None = None
+    emission: Float32Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +224,7 @@ class EnvironmentAsset:
     """
 
     name: str  # short, used in paths
-    radiance: Floats  # (H, W, 3) linear radiance
+    radiance: Float32Array  # (H, W, 3) linear radiance
     source: str = ""  # where it came from
     # what the importer had to repair or leave out, one sentence each
     warnings: tuple[str, ...] = ()
@@ -253,7 +255,7 @@ class EnvironmentAsset:
             )
 
 
-def face_vectors(corners: Doubles) -> Doubles:
+def compute_area_vectors(corners: Float64Array) -> Float64Array:
     """Return the outward vectors (F, 3) of triangles (F, 3, 3), counter-clockwise.
 
     They are twice as long as the areas.
@@ -261,35 +263,35 @@ def face_vectors(corners: Doubles) -> Doubles:
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def pose_of(linear: npt.ArrayLike, place: npt.ArrayLike) -> Doubles:
+def make_pose(linear: npt.ArrayLike, translation: npt.ArrayLike) -> Float64Array:
     """Return the pose (4, 4) `linear @ v + place` of a matrix (3, 3) and a shift (3,)."""
     pose = np.eye(4)
     pose[:3, :3] = linear
-    pose[:3, 3] = place
+    pose[:3, 3] = translation
     return pose
 
 
-def footing(points: Doubles) -> tuple[Doubles, float]:
+def find_footing(points: Float64Array) -> tuple[Float64Array, float]:
     """Return the point (3,) in the middle below points (N, 3), and their extent."""
     low = points.min(axis=0)
     high = points.max(axis=0)
     return np.array([*(low[:2] + high[:2]) / 2.0, low[2]]), float((high - low).max())
 
 
-def grouped(numbers: Ints) -> list[Ints]:
+def group_indices(group_of: IntArray) -> list[IntArray]:
     """Return the rising indices (n,) of each group, from 0 to the largest one."""
     return np.split(
-        np.argsort(numbers, kind="stable"), np.cumsum(np.bincount(numbers))[:-1]
+        np.argsort(group_of, kind="stable"), np.cumsum(np.bincount(group_of))[:-1]
     )
 
 
-def normalised(mesh: Mesh) -> Mesh:
+def normalise_mesh(mesh: Mesh) -> Mesh:
     """Return the mesh with its largest extent 1, standing on z = 0 and centered.
 
     Raises InputError: all vertices coincide, so there is no size to normalise.
     """
     vertices = mesh.vertices.astype(np.float64)
-    origin, size = footing(vertices)
+    origin, size = find_footing(vertices)
     if not size > 0.0:
         raise InputError(
             "mesh has no extent: all its vertices coincide; export the mesh again"
@@ -298,13 +300,13 @@ def normalised(mesh: Mesh) -> Mesh:
 
 
 # cells along the mesh's largest extent, tried in turn
-GRIDS = (384, 256, 192, 128, 96, 64, 48, 32, 24, 16, 12, 8)
+SIMPLIFICATION_GRIDS = (384, 256, 192, 128, 96, 64, 48, 32, 24, 16, 12, 8)
 # of the texture along each side: vertices of one place in different ones stay apart, as
 # at seams
 TEXTURE_CELLS = 32
 
 
-def simpler(mesh: Mesh, most: int) -> Callable[[Mesh], Mesh] | None:
+def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None:
     """Return a function that simplifies a mesh, also once its vertices are elsewhere.
 
     After Rossignac and Borrel (1993, "Multi-resolution 3D approximations for rendering
@@ -314,15 +316,15 @@ def simpler(mesh: Mesh, most: int) -> Callable[[Mesh], Mesh] | None:
 
     Args:
         mesh: the full mesh.
-        most: faces that are left at most, or the fewest of a coarse grid.
+        max_faces: faces that are left at most, or the fewest of a coarse grid.
 
     Returns:
         None if the mesh has no more faces.
     """
-    if len(mesh.faces) <= most:
+    if len(mesh.faces) <= max_faces:
         return None
     chart = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(np.int64)
-    for grid in GRIDS:
+    for grid in SIMPLIFICATION_GRIDS:
         cluster_of = _cluster_vertices(mesh, grid)
         # vertices of a cluster in different parts of the texture stay apart
         cluster_and_chart = _encode_rows(np.column_stack([cluster_of, chart]))
@@ -332,7 +334,7 @@ def simpler(mesh: Mesh, most: int) -> Callable[[Mesh], Mesh] | None:
         faces = new_vertex.reshape(-1)[mesh.faces]
         first, second, third = cluster_of[representative][faces].T
         faces = faces[(first != second) & (second != third) & (third != first)]
-        if len(faces) <= most:
+        if len(faces) <= max_faces:
             break
     distinct_faces = np.unique(faces, axis=0).astype(np.uint32)
     cluster_size = np.bincount(cluster_of)
@@ -350,7 +352,7 @@ def simpler(mesh: Mesh, most: int) -> Callable[[Mesh], Mesh] | None:
     return simplify
 
 
-def _cluster_vertices(mesh: Mesh, grid: int) -> Ints:
+def _cluster_vertices(mesh: Mesh, grid: int) -> IntArray:
     """Return the cluster (V,) of each vertex: the cell of a grid that it is in.
 
     Args:
@@ -364,7 +366,7 @@ def _cluster_vertices(mesh: Mesh, grid: int) -> Ints:
     return np.unique(_encode_rows(cells), return_inverse=True)[1].reshape(-1)
 
 
-def _encode_rows(rows: Ints) -> Ints:
+def _encode_rows(rows: IntArray) -> IntArray:
     """Return one number for each row of whole numbers, the same for equal rows only."""
     low = rows.min(axis=0)
     sizes = rows.max(axis=0) - low + 1
@@ -383,13 +385,13 @@ def _encode_rows(rows: Ints) -> Ints:
 # stands beside the object) divides by `SceneDescription.metres`.
 
 # metres of the units that a mesh may be in
-UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
+METRES_PER_UNIT = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
 # metres above the floor from which photographed environments are taken, where nobody
 # says it
-TRIPOD = 1.6
-SMALLEST = 1e-4  # metres of an object's longest side
-LARGEST = 1e4
-USUAL = {
+TRIPOD_HEIGHT = 1.6
+MIN_METRES = 1e-4  # metres of an object's longest side
+MAX_METRES = 1e4
+USUAL_SIZES = {
     "airplane": (6.0, 75.0),
     "apple": (0.05, 0.12),
     "backpack": (0.3, 0.8),
@@ -450,19 +452,19 @@ of an object.
 """
 
 
-def on_roads(asset: ObjectAsset) -> bool:
+def is_road_vehicle(asset: ObjectAsset) -> bool:
     """Tell whether an object is a vehicle of the road whose size is known."""
     words = re.split(r"[^a-z]+", f"{asset.name} {asset.label or ''}".lower())
     return asset.metres is not None and not ROAD_VEHICLES.isdisjoint(words)
 
 
-def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAsset:
+def with_size(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAsset:
     """Return an object with its size in metres, if it is known.
 
     Args:
         asset: the object.
         size: its longest side in metres.
-        unit: of its file, one of `UNITS`.
+        unit: of its file, one of `METRES_PER_UNIT`.
 
     Raises:
         InputError: both are given, the size is out of range, or the object comes
@@ -474,62 +476,74 @@ def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAss
         raise InputError(
             "size and unit: both say how large the object is; leave one of them out"
         )
-    if unit is not None and unit not in UNITS:
-        raise InputError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
+    if unit is not None and unit not in METRES_PER_UNIT:
+        raise InputError(
+            f"unit: expected one of {', '.join(METRES_PER_UNIT)}, got {unit!r}"
+        )
     if unit is not None and asset.extent is None:
         raise InputError(
             f"unit: {asset.name} is no mesh file; give its longest side "
             "in metres, such as size=0.1"
         )
     metres = (
-        float(size) if size is not None else (asset.extent or 0.0) * UNITS[unit or "m"]
+        float(size)
+        if size is not None
+        else (asset.extent or 0.0) * METRES_PER_UNIT[unit or "m"]
     )
-    if not SMALLEST <= metres <= LARGEST:
+    if not MIN_METRES <= metres <= MAX_METRES:
         statement = (
             f"size={size:g}"
             if size is not None
             else (f"unit={unit} for a mesh of {asset.extent:.4g}")
         )
         raise InputError(
-            f"{statement}: expected a longest side of {SMALLEST:g} to {LARGEST:g} metres, "
+            f"{statement}: expected a longest side of {MIN_METRES:g} to {MAX_METRES:g} metres, "
             f"got {metres:.4g}; give it in "
             "metres, such as size=4.9"
         )
     return replace(asset, metres=metres)
 
 
-def doubts(asset: ObjectAsset, *, asked: bool, laid: bool) -> tuple[str, ...]:
+def describe_size_doubts(
+    asset: ObjectAsset, *, has_user_size: bool, needs_metres: bool
+) -> tuple[str, ...]:
     """Return a remark where an object's size is unusual for its name, or unknown.
 
     Args:
         asset: the object.
-        asked: whether its user gave its size.
-        laid: whether something in the scene is in metres, such as the road.
+        has_user_size: whether its user gave its size.
+        needs_metres: whether something in the scene is in metres, such as the road.
     """
     kind = next(
         (
             word
             for word in reversed(re.split(r"[^a-z]+", asset.name.lower()))
-            if word in USUAL
+            if word in USUAL_SIZES
         ),
         None,
     )
-    low, high = (0.005, 100.0) if kind is None else USUAL[kind]
+    low, high = (0.005, 100.0) if kind is None else USUAL_SIZES[kind]
     is_unusual = asset.metres is not None and not low <= asset.metres <= high
     is_unknown = asset.metres is None and (
-        laid or (kind is not None and asset.extent is not None)
+        needs_metres or (kind is not None and asset.extent is not None)
     )
-    if asked or not (is_unusual or is_unknown):
+    if has_user_size or not (is_unusual or is_unknown):
         return ()
     extent = 0.0 if asset.extent is None or kind is None else asset.extent
-    fits = [unit for unit, metres in UNITS.items() if low <= extent * metres <= high]
+    fits = [
+        unit
+        for unit, metres in METRES_PER_UNIT.items()
+        if low <= extent * metres <= high
+    ]
     clauses = [
-        f"its longest side is {rounded(asset.metres or 0.0)} m"
+        f"its longest side is {format_rounded(asset.metres or 0.0)} m"
         if is_unusual
         else "its size in metres is not known",
-        f"it is {rounded(extent)} in its file" if is_unknown and extent else "",
+        f"it is {format_rounded(extent)} in its file" if is_unknown and extent else "",
         f"a {kind}'s is {low:g} to {high:g} m" if kind else "",
-        "it is taken for 1 m, as the road is in metres" if is_unknown and laid else "",
+        "it is taken for 1 m, as the road is in metres"
+        if is_unknown and needs_metres
+        else "",
     ]
     remedy = (
         f"give its longest side in metres, such as `size={(low * high) ** 0.5:.2g}`"
@@ -537,7 +551,7 @@ def doubts(asset: ObjectAsset, *, asked: bool, laid: bool) -> tuple[str, ...]:
     if fits:
         remedy += (
             f", or `unit={fits[0]}`, which makes it "
-            f"{rounded(extent * UNITS[fits[0]])} m"
+            f"{format_rounded(extent * METRES_PER_UNIT[fits[0]])} m"
         )
     return (
         f"{asset.name}: {'; '.join(filter(None, clauses))}. "

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.camera_entries import number, select_camera
-from advsearch.scene.importing.files import shown
+from advsearch.scene.camera_entries import parse_number, select_camera
+from advsearch.scene.importing.files import format_name
 
 FIT_FISHEYE = (
     "calibrate it as a fisheye of OpenCV (cv2.fisheye.calibrate, Kalibr's "
@@ -87,13 +87,13 @@ OTHER_FORMATS: tuple[tuple[str, str, str], ...] = (
 
 METASHAPE_FILE = "calibration"
 METASHAPE_PROJECT = ("document", "chunk", "sensors", "sensor")
-ORBSLAM = re.compile(r"(Camera\d?)\.fx")
+ORBSLAM_CAMERA = re.compile(r"(Camera\d?)\.fx")
 ORBSLAM_KINDS = {
     "pinhole": "radtan",
     "kannalabrandt8": "kannala_brandt",
     "rectified": "none",
 }
-ORBSLAM_OF_NO_LENS = re.compile(
+ORBSLAM_NON_LENS_KEYS = re.compile(
     r"(ORBextractor|Viewer|IMU|System|Stereo|RGBD|LoopClosing|File|Initializer|Tracking|Mapping|Preprocessing)\..*"
     r"|Camera\d?\.(fps|RGB|bf|b|overlappingBegin|overlappingEnd|name|setup|color_order)|ThDepth|DepthMapFactor"
 )
@@ -110,7 +110,7 @@ STELLA_NAMES = {
 KITTI_PROJECTION = re.compile(r"P\d")
 KITTI_RAW = re.compile(r"K_(\d\d)")
 KITTI_RECTIFIED = re.compile(r"P_(rect_\d\d)")
-KITTI_OF_NO_LENS = re.compile(
+KITTI_NON_LENS_KEYS = re.compile(
     r"P\d|R0_rect|R_rect|Tr(_\w+)?|calib_time|corner_dist|(S|K|D|R|T|P)_(rect_)?\d\d"
 )
 REALSENSE_NAMES = {"ppx": "cx", "ppy": "cy", "model": "distortion_model"}
@@ -154,13 +154,13 @@ def check_xml_root(path: str, tag: str) -> None:
 
 
 def translate_entries(
-    path: str, which: str, data: Mapping[str, Any]
+    path: str, camera_name: str, data: Mapping[str, Any]
 ) -> dict[str, Any] | None:
     """Translate the entries of one camera to those of OpenCV's files.
 
     Args:
         path: the file.
-        which: the name of the camera, "" if none is named.
+        camera_name: the name of the camera, "" if none is named.
         data: all entries of the file.
 
     Returns:
@@ -170,18 +170,20 @@ def translate_entries(
         FileFormatError: it has another projection, several cameras of which none is
             named, or lacks numbers.
     """
-    orbslam_cameras = [match[1] for name in data if (match := ORBSLAM.fullmatch(name))]
+    orbslam_cameras = [
+        match[1] for name in data if (match := ORBSLAM_CAMERA.fullmatch(name))
+    ]
     if orbslam_cameras:
-        return _translate_orbslam(path, which, data, orbslam_cameras)
+        return _translate_orbslam(path, camera_name, data, orbslam_cameras)
     kitti_cameras = _find_kitti(data)
     if kitti_cameras:
-        return _translate_kitti(path, which, data, kitti_cameras)
+        return _translate_kitti(path, camera_name, data, kitti_cameras)
     if data and all(
         isinstance(entry, dict) and "projection_type" in entry
         for entry in data.values()
     ):
-        return _translate_opensfm(path, select_camera(path, which, data))
-    if which:
+        return _translate_opensfm(path, select_camera(path, camera_name, data))
+    if camera_name:
         return None
     stella = data.get("Camera")
     if isinstance(stella, dict) and "model" in stella:
@@ -194,7 +196,7 @@ def translate_entries(
         return {
             name: value
             for name, value in entries.items()
-            if not ORBSLAM_OF_NO_LENS.fullmatch(f"Camera.{name}")
+            if not ORBSLAM_NON_LENS_KEYS.fullmatch(f"Camera.{name}")
         }
     if "ppx" in data:
         return _translate_realsense(data)
@@ -206,9 +208,9 @@ def translate_entries(
 
 
 def _translate_orbslam(
-    path: str, which: str, data: Mapping[str, Any], cameras: list[str]
+    path: str, camera_name: str, data: Mapping[str, Any], cameras: list[str]
 ) -> dict[str, Any]:
-    camera = select_camera(path, which, dict(zip(cameras, cameras, strict=True)))
+    camera = select_camera(path, camera_name, dict(zip(cameras, cameras, strict=True)))
     stated = str(data.get("Camera.type", "PinHole"))
     entries: dict[str, Any] = {
         "distortion_model": ORBSLAM_KINDS.get(stated.lower(), stated)
@@ -217,7 +219,7 @@ def _translate_orbslam(
     for name, value in data.items():
         group, _, rest = name.partition(".")
         if (
-            ORBSLAM_OF_NO_LENS.fullmatch(name)
+            ORBSLAM_NON_LENS_KEYS.fullmatch(name)
             or group in others
             or name == "Camera.type"
         ):
@@ -255,19 +257,19 @@ def _read_numbers(
     if len(words) != count:
         raise FileFormatError(
             f"{path}: {name}: expected {count} numbers, got "
-            f"{shown(' '.join(words) or 'nothing')}"
+            f"{format_name(' '.join(words) or 'nothing')}"
         )
-    return [number(path, name, word) for word in words]
+    return [parse_number(path, name, word) for word in words]
 
 
 def _translate_kitti(
-    path: str, which: str, data: Mapping[str, Any], cameras: Mapping[str, str]
+    path: str, camera_name: str, data: Mapping[str, Any], cameras: Mapping[str, str]
 ) -> dict[str, Any]:
-    matrix_name = select_camera(path, which, cameras)
+    matrix_name = select_camera(path, camera_name, cameras)
     entries = {
         name: value
         for name, value in data.items()
-        if not KITTI_OF_NO_LENS.fullmatch(name)
+        if not KITTI_NON_LENS_KEYS.fullmatch(name)
     }
     raw = KITTI_RAW.fullmatch(matrix_name)
     if raw:
@@ -329,7 +331,7 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
         )
     }
     width, height = (
-        number(path, side, camera.get(side)) for side in ("width", "height")
+        parse_number(path, side, camera.get(side)) for side in ("width", "height")
     )
     entries |= {
         "distortion_model": OPENSFM_KINDS.get(stated, stated),
@@ -339,13 +341,13 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
     if OPENSFM_KINDS.get(stated) in (None, "equirectangular"):
         return entries
     side = max(width, height)  # lengths are in this
-    focal_x = number(path, "focal_x", camera.get("focal_x", camera.get("focal")))
+    focal_x = parse_number(path, "focal_x", camera.get("focal_x", camera.get("focal")))
     entries["fx"] = side * focal_x
-    entries["fy"] = side * number(path, "focal_y", camera.get("focal_y", focal_x))
-    entries["cx"] = (width - 1.0) / 2.0 + side * number(
+    entries["fy"] = side * parse_number(path, "focal_y", camera.get("focal_y", focal_x))
+    entries["cx"] = (width - 1.0) / 2.0 + side * parse_number(
         path, "c_x", camera.get("c_x", 0.0)
     )
-    entries["cy"] = (height - 1.0) / 2.0 + side * number(
+    entries["cy"] = (height - 1.0) / 2.0 + side * parse_number(
         path, "c_y", camera.get("c_y", 0.0)
     )
     return entries
@@ -359,10 +361,12 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """
     stated = str(data.get("projection", "frame"))
     value = {
-        name: number(path, name, data.get(name, 0.0))
+        name: parse_number(path, name, data.get(name, 0.0))
         for name in ("f", "cx", "cy", "b1", "b2", "k4", "p1", "p2")
     }
-    width, height = (number(path, side, data.get(side)) for side in ("width", "height"))
+    width, height = (
+        parse_number(path, side, data.get(side)) for side in ("width", "height")
+    )
     entries = {
         name: entry
         for name, entry in data.items()

@@ -16,25 +16,25 @@ from advsearch.errors import FileFormatError
 from advsearch.scene.camera_model import (
     COEFFICIENTS,
     EQUIRECTANGULAR,
-    NUMBERS,
+    NUMBER_NAMES,
     CameraModel,
 )
-from advsearch.scene.importing.files import shown
+from advsearch.scene.importing.files import format_name
 from advsearch.scene.importing.unread import TrackedKeys, join_names
 
-MOST_PIXELS = 1 << 16  # limit of the sides of an image
+MAX_SIDE = 1 << 16  # limit of the sides of an image
 # Limits of coefficients, and of focal lengths in sides of the image.
-LARGEST_COEFFICIENT = 1e4
-LARGEST_FOCAL = 1e3
-BENDS = re.compile(
+MAX_COEFFICIENT = 1e4
+MAX_FOCAL_RATIO = 1e3
+IMAGE_CHANGING_KEYS = re.compile(
     r"xi|mu|mv|[dkps]\d?|t(au)?[xy]|alpha|beta|gamma\d*|omega|.*dist(?!ance).*|.*skew.*|.*shear.*|.*mirror.*|.*tilt.*|"
     r".*coeff.*|.*flip.*|.*rotate.*|image(rotation|scale)|scale(factor)?|resize.*|(is|image)?rectified|"
     r".*roi.*|.*crop.*|.*binning.*|.*decimat.*|.*fisheye.*|.*lens.*model|.*poly.*|.*affine.*|.*projectionparam.*"
 )
 """Plain names of entries that change the image, and are rejected unless they are read."""
 # Plain names of entries about rectified images.
-OF_RECTIFIED = re.compile(r"r|p|rectificationmatrix|projectionmatrix")
-QUIET = re.compile(
+RECTIFICATION_KEYS = re.compile(r"r|p|rectificationmatrix|projectionmatrix")
+IGNORED_KEYS = re.compile(
     # Who made it, when, and how accurately.
     r"camera(name|id|info|label|serial.*|index)?|camname|name|label|sensor(type|name|id)?|serial(number)?|comment|version"
     r"|header|stamp|frameid|seq|rostopic|topic|ratehz|fps|framerate|calibration(time|date|flags)|date|time|flags(value)?"
@@ -48,7 +48,7 @@ QUIET = re.compile(
 MATRIX_KEYS = frozenset(("rows", "cols", "dt", "data", "sizes", "type_id"))
 
 
-def plain(name: str) -> str:
+def normalize_key(name: str) -> str:
     """Return a name in lower case, without separators between its words."""
     return re.sub(r"[-_\s.]", "", name).lower()
 
@@ -63,92 +63,95 @@ class Entries:
         FileFormatError: two entries have the same plain name.
     """
 
-    def __init__(self, path: str, given: Mapping[str, Any]) -> None:
+    def __init__(self, path: str, values: Mapping[str, Any]) -> None:
         self.path = path
-        self._keys: TrackedKeys[Any] = TrackedKeys(given, fold=plain)
+        self._keys: TrackedKeys[Any] = TrackedKeys(values, fold=normalize_key)
         for first in self._keys.repeated:
-            other = self._keys.spelled(plain(first))
+            other = self._keys.get_spelling(normalize_key(first))
             raise FileFormatError(
-                f"{path}: has {shown(first)} and {shown(other)}; leave one of them out"
+                f"{path}: has {format_name(first)} and {format_name(other)}; leave one of them out"
             )
         # Keys of matrices that are not read.
-        self._odd: list[str] = []
+        self._unread_matrix_keys: list[str] = []
 
     def get(self, *names: str) -> Any:
         """Return the first of some entries that has a value, or None."""
         return self._keys.get(*names)
 
-    def there(self, name: str, names: Sequence[str] = ()) -> Any:
+    def require(self, name: str, aliases: Sequence[str] = ()) -> Any:
         """Return an entry that is required, or the first of several names for it.
 
         Raises:
             FileFormatError: there is none.
         """
-        value = self.get(*(names or (plain(name),)))
+        value = self.get(*(aliases or (normalize_key(name),)))
         if value is None:
-            spelled = [self._keys.spelled(key) for key, _ in self._keys.items()]
+            spelled = [self._keys.get_spelling(key) for key, _ in self._keys.items()]
             got = join_names(spelled, 8) or "nothing"
             raise FileFormatError(f"{self.path}: expected {name}, got {got}; add it")
         return value
 
-    def number(
-        self, name: str, otherwise: float | None = None, names: Sequence[str] = ()
+    def get_number(
+        self, name: str, default: float | None = None, aliases: Sequence[str] = ()
     ) -> float:
         """Return a finite number, or a default if there is no such entry.
 
         Args:
             name: the entry.
-            otherwise: the default; None if the entry is required.
-            names: plain names for the entry, if there are several.
+            default: the default; None if the entry is required.
+            aliases: plain names for the entry, if there are several.
 
         Raises:
             FileFormatError: it is no number, or is required and missing.
         """
-        if otherwise is not None and self.get(*(names or (plain(name),))) is None:
-            return otherwise
-        return number(self.path, name, self.there(name, names))
+        if (
+            default is not None
+            and self.get(*(aliases or (normalize_key(name),))) is None
+        ):
+            return default
+        return parse_number(self.path, name, self.require(name, aliases))
 
-    def numbers(
-        self, shown_as: str, given: object, counts: Sequence[int]
+    def parse_numbers(
+        self, name: str, entry: object, counts: Sequence[int]
     ) -> list[float]:
         """Return a list of numbers: flat, in rows, or in the `data` of a matrix.
 
         Args:
-            shown_as: name of the entry, for messages.
-            given: its value.
+            name: name of the entry, for messages.
+            entry: its value.
             counts: the lengths that it may have.
 
         Raises:
             FileFormatError: it has another length, or other values.
         """
-        if isinstance(given, Mapping):
-            self._odd += [
-                f"{shown_as}.{key}" for key in given if key not in MATRIX_KEYS
+        if isinstance(entry, Mapping):
+            self._unread_matrix_keys += [
+                f"{name}.{key}" for key in entry if key not in MATRIX_KEYS
             ]
-            given = given.get("data")
-        values = _flat(given)
+            entry = entry.get("data")
+        values = _flatten(entry)
         if len(values) not in counts:
             expected = " or ".join(map(str, counts))
             raise FileFormatError(
-                f"{self.path}: {shown_as}: expected a list of "
+                f"{self.path}: {name}: expected a list of "
                 f"{expected} numbers, got {len(values)}"
             )
-        return [number(self.path, shown_as, value) for value in values]
+        return [parse_number(self.path, name, value) for value in values]
 
-    def told(self, within: str = "") -> list[str]:
+    def find_unread(self, prefix: str = "") -> list[str]:
         """Return the entries that were not read and need a note, as the file spells them.
 
         Args:
-            within: prefix for the entry that they are within, with a dot.
+            prefix: prefix for the entry that they are within, with a dot.
 
         Raises:
             FileFormatError: one of them changes the image.
         """
-        unread = [within + key for key in self._odd]
-        for spelled in self._keys.unread(
-            lambda name, _: QUIET.fullmatch(name) is not None
+        unread = [prefix + key for key in self._unread_matrix_keys]
+        for spelled in self._keys.find_unread(
+            lambda name, _: IGNORED_KEYS.fullmatch(name) is not None
         ):
-            name = plain(spelled)
+            name = normalize_key(spelled)
             value = self._keys.peek(name)
             is_matrix = isinstance(value, (list, Mapping))
             is_coefficient = name in COEFFICIENTS and not is_matrix
@@ -158,23 +161,23 @@ class Entries:
                 and not is_coefficient
             )
             changes_image = (
-                BENDS.fullmatch(name)
-                and not OF_RECTIFIED.fullmatch(name)
+                IMAGE_CHANGING_KEYS.fullmatch(name)
+                and not RECTIFICATION_KEYS.fullmatch(name)
                 and not is_of_second_camera
             )
             if not changes_image:
-                unread.append(within + spelled)
-            elif not nothing(value):
+                unread.append(prefix + spelled)
+            elif not is_neutral(value):
                 raise FileFormatError(
-                    f"{self.path}: expected no {shown(within + spelled)}, got "
-                    f"{shown(str(value))}: it makes another"
+                    f"{self.path}: expected no {format_name(prefix + spelled)}, got "
+                    f"{format_name(str(value))}: it makes another"
                     " picture and is not read; calibrate with one of the models in "
                     "docs/cameras.md"
                 )
         return unread
 
 
-def select_camera(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
+def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> Any:
     """Return the camera of a name out of those of a file, or the only one.
 
     Raises:
@@ -186,30 +189,30 @@ def select_camera(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
     if len(names) > 8:
         listing += ", ..."
     first = f"{path}#{names[0]}"
-    if which and which not in names:
+    if camera_name and camera_name not in names:
         raise FileFormatError(
             f"{path}: expected one of its cameras {listing}, got "
-            f"{which[:40]!r}; write {first}"
+            f"{camera_name[:40]!r}; write {first}"
         )
-    if not which and len(names) > 1:
+    if not camera_name and len(names) > 1:
         raise FileFormatError(
             f"{path}: has {len(names)} cameras, {listing}: say which one takes the "
             f"picture, as in {first}"
         )
-    return cameras[which or names[0]]
+    return cameras[camera_name or names[0]]
 
 
-def nothing(value: object) -> bool:
+def is_neutral(value: object) -> bool:
     """Return whether a value changes nothing: it is zero, empty or none."""
     if isinstance(value, Mapping):
         value = value.get("data", list(value.values()))
     return all(
-        cell in (None, False, "", "none") or _float(str(cell)) == 0.0
-        for cell in _flat(value)
+        cell in (None, False, "", "none") or _to_float(str(cell)) == 0.0
+        for cell in _flatten(value)
     )
 
 
-def _float(value: object) -> float:
+def _to_float(value: object) -> float:
     """Return a value as a number, NaN if it is none."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return math.nan
@@ -219,7 +222,7 @@ def _float(value: object) -> float:
         return math.nan
 
 
-def _flat(value: object) -> list[Any]:
+def _flatten(value: object) -> list[Any]:
     """Return the values of a list of lists, of a list, or of a single value."""
     values: list[Any] = []
     for row in value if isinstance(value, list) else [value]:
@@ -227,46 +230,49 @@ def _flat(value: object) -> list[Any]:
     return values
 
 
-def number(path: str, name: str, given: object) -> float:
+def parse_number(path: str, name: str, entry: object) -> float:
     """Return an entry as a finite number.
 
     Raises:
         FileFormatError: it is none.
     """
-    value = _float(given)
+    value = _to_float(entry)
     if not math.isfinite(value):
         raise FileFormatError(
             f"{path}: {name}: expected a finite number, got "
-            f"{str(given)[:40]!r}; correct it"
+            f"{str(entry)[:40]!r}; correct it"
         )
     return value
 
 
-def with_told(
-    model: CameraModel, left: Sequence[str], rectified: Sequence[str] = ()
+def add_notes(
+    model: CameraModel, unread_keys: Sequence[str], rectified_keys: Sequence[str] = ()
 ) -> CameraModel:
     """Return a model with notes on the entries that were not read.
 
     Args:
         model: the model.
-        left: entries of the camera.
-        rectified: entries about rectified images.
+        unread_keys: entries of the camera.
+        rectified_keys: entries about rectified images.
     """
-    unread = [f"{join_names(left)}."] if left else []
-    if rectified:
+    unread = [f"{join_names(unread_keys)}."] if unread_keys else []
+    if rectified_keys:
         reason = "which are made of the camera's own ones; these are its own."
-        unread.append(f"{' and '.join(rectified)}, about rectified pictures, {reason}")
+        unread.append(
+            f"{' and '.join(rectified_keys)}, about rectified pictures, {reason}"
+        )
     return replace(
-        model, told=tuple(f"{model.name}: not read: {names}" for names in unread)
+        model,
+        reading_notes=tuple(f"{model.name}: not read: {names}" for names in unread),
     )
 
 
-def made(
+def make_camera_model(
     spec: str,
     kind: str,
     size: tuple[float, float],
-    found: Mapping[str, float],
-    first: float = 0.0,
+    pixel_values: Mapping[str, float],
+    pixel_offset: float = 0.0,
 ) -> CameraModel:
     """Make a camera model of numbers in pixels.
 
@@ -274,8 +280,8 @@ def made(
         spec: the file, and perhaps the camera in it.
         kind: the kind of model.
         size: height and width of the image.
-        found: numbers by their names in `NUMBERS`; 0 by default.
-        first: coordinate that the file's principal point needs added to count from the
+        pixel_values: numbers by their names in `NUMBER_NAMES`; 0 by default.
+        pixel_offset: coordinate that the file's principal point needs added to count from the
             corner of the image.
 
     Raises:
@@ -283,17 +289,22 @@ def made(
     """
     path = spec.partition("#")[0]
     height, width = size
-    if not all(side == int(side) and 1 <= side <= MOST_PIXELS for side in size):
+    if not all(side == int(side) and 1 <= side <= MAX_SIDE for side in size):
         raise FileFormatError(
-            f"{path}: expected a width and a height from 1 to {MOST_PIXELS} pixels, got "
+            f"{path}: expected a width and a height from 1 to {MAX_SIDE} pixels, got "
             f"{width:g} x {height:g}"
         )
     if kind == EQUIRECTANGULAR:
-        found = {"fx": width, "fy": height, "cx": width / 2.0, "cy": height / 2.0}
-        first = 0.0
-    value = {name: found.get(name, 0.0) for name in NUMBERS}
-    value["cx"] = value["cx"] + first
-    value["cy"] = value["cy"] + first
+        pixel_values = {
+            "fx": width,
+            "fy": height,
+            "cx": width / 2.0,
+            "cy": height / 2.0,
+        }
+        pixel_offset = 0.0
+    value = {name: pixel_values.get(name, 0.0) for name in NUMBER_NAMES}
+    value["cx"] = value["cx"] + pixel_offset
+    value["cy"] = value["cy"] + pixel_offset
     _check_numbers(path, value, width, height)
     unit = {"fx": width, "fy": height, "cx": width, "cy": height, "skew": width}
     numbers = tuple(number / unit.get(name, 1.0) for name, number in value.items())
@@ -312,8 +323,8 @@ def _check_numbers(
             )
 
     for name, side in (("fx", width), ("fy", height)):
-        low = side / LARGEST_FOCAL
-        high = side * LARGEST_FOCAL
+        low = side / MAX_FOCAL_RATIO
+        high = side * MAX_FOCAL_RATIO
         check(
             name,
             low <= value[name] <= high,
@@ -329,8 +340,8 @@ def _check_numbers(
     for name in COEFFICIENTS:
         check(
             name,
-            abs(value[name]) <= LARGEST_COEFFICIENT,
-            f"a coefficient from -{LARGEST_COEFFICIENT:g} to {LARGEST_COEFFICIENT:g}",
+            abs(value[name]) <= MAX_COEFFICIENT,
+            f"a coefficient from -{MAX_COEFFICIENT:g} to {MAX_COEFFICIENT:g}",
             "; is it in the order of OpenCV?",
         )
 
@@ -350,9 +361,11 @@ class CameraPreset:
     distance: float
     # Whether azimuth 0 is in the object's lane, behind what drives there.
     in_lane: bool
-    aside: float  # how far to either side a search goes, degrees; 180 for all around
+    search_azimuth: (
+        float  # how far to either side a search goes, degrees; 180 for all around
+    )
     # Other ranges that are searched by default; what has none stays.
-    search: Mapping[str, tuple[float, float]]
+    search_ranges: Mapping[str, tuple[float, float]]
 
 
 PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
@@ -360,23 +373,23 @@ PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
         # Behind the windscreen of a car, in the lane of the object. What glass and
         # dashboard do to a picture is not in it.
         "dashcam": CameraPreset(
-            height=1.3, fov=75.0, distance=10.0, in_lane=True, aside=10.0,
-            search={"distance": (6.0, 60.0), "fov": (60.0, 90.0)},
+            height=1.3, fov=75.0, distance=10.0, in_lane=True, search_azimuth=10.0,
+            search_ranges={"distance": (6.0, 60.0), "fov": (60.0, 90.0)},
         ),
         # The head of a humanoid: the Unitree G1 is 1.32 m tall (its product page), with
         # a RealSense D435i in its face, about a tenth of a metre below the top. The
         # colour picture of that has 69 x 42 degrees, and its depth reaches to 3 m
         # (Clearpath Robotics, documentation of the RealSense D435).
         "robot": CameraPreset(
-            height=1.2, fov=69.0, distance=1.0, in_lane=False, aside=180.0,
-            search={"distance": (0.5, 3.0)},
+            height=1.2, fov=69.0, distance=1.0, in_lane=False, search_azimuth=180.0,
+            search_ranges={"distance": (0.5, 3.0)},
         ),
     }
 )  # fmt: skip
 """The mounted cameras by name."""
-TABLE = 0.75
+TABLE_HEIGHT = 0.75
 TABLE_SIDE = 1.2
 """Height and side in metres of a table of a bundled room, on which objects stand that are
-no larger than `ON_TABLES`.
+no larger than `MAX_TABLETOP_SIZE`.
 """
-ON_TABLES = 0.5  # metres of the longest side
+MAX_TABLETOP_SIZE = 0.5  # metres of the longest side

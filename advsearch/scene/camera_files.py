@@ -29,12 +29,12 @@ from advsearch.scene.camera_dialects import (
 )
 from advsearch.scene.camera_entries import (
     Entries,
-    made,
-    nothing,
-    number,
-    plain,
+    add_notes,
+    is_neutral,
+    make_camera_model,
+    normalize_key,
+    parse_number,
     select_camera,
-    with_told,
 )
 from advsearch.scene.camera_model import (
     BROWN_CONRADY,
@@ -43,15 +43,15 @@ from advsearch.scene.camera_model import (
     FISHEYE,
     CameraModel,
 )
-from advsearch.scene.importing.files import CAMERAS, shown
+from advsearch.scene.importing.files import CAMERA_FORMAT_ADVICE, format_name
 from advsearch.trust.stored_files import parse_json, parsed, present_text
 from advsearch.trust.yaml_text import LARGEST, parse_yaml
 
 # Limit of the bytes of a JSON file, which may have the pose of every image.
-LARGEST_JSON = 1 << 25
-MOST_BINNED = 64  # limit of the pixels along a side that a sensor bins into one
+MAX_JSON_SIZE = 1 << 25
+MAX_BINNING = 64  # limit of the pixels along a side that a sensor bins into one
 # Coefficients in the order of OpenCV and ROS.
-IN_OPENCV = (
+OPENCV_COEFFICIENTS = (
     "k1",
     "k2",
     "p1",
@@ -67,8 +67,8 @@ IN_OPENCV = (
     "tauX",
     "tauY",
 )
-LENGTHS = (0, 4, 5, 8, 12, 14)  # how many coefficients there may be
-COLMAP: Mapping[str, tuple[str, str]] = {
+OPENCV_COEFFICIENT_COUNTS = (0, 4, 5, 8, 12, 14)  # how many coefficients there may be
+COLMAP_MODELS: Mapping[str, tuple[str, str]] = {
     "SIMPLE_PINHOLE": (BROWN_CONRADY, "f cx cy"),
     "PINHOLE": (BROWN_CONRADY, "fx fy cx cy"),
     "SIMPLE_RADIAL": (BROWN_CONRADY, "f cx cy k1"),
@@ -86,21 +86,21 @@ COLMAP: Mapping[str, tuple[str, str]] = {
 
 FOV, EUCM, the division models and fisheyes with a thin prism are not supported.
 """
-_OF_BROWN = (
+_BROWN_CONRADY_NAMES = (
     "plumb_bob rational_polynomial thin_prism radtan radial_tangential "
     "brown_conrady none"
 ).split()
-OF_DISTORTION = {
-    **dict.fromkeys((*_OF_BROWN, ""), BROWN_CONRADY),
+KIND_OF_DISTORTION = {
+    **dict.fromkeys((*_BROWN_CONRADY_NAMES, ""), BROWN_CONRADY),
     **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt"), FISHEYE),
     EQUIRECTANGULAR: EQUIRECTANGULAR,
 }
 """Kinds of the distortion models of ROS, Kalibr and EuRoC."""
-MATRIX = (
+CAMERA_MATRIX_KEYS = (
     *("cameramatrix", "k", "intrinsicmatrix", "mtx", "cameramatrix1", "m1"),
     *("intrinsics", "cameraintrinsics"),  # of ARKit
 )
-DISTORTION = (
+DISTORTION_KEYS = (
     *(
         "distortioncoefficients",
         "distcoeffs",
@@ -112,12 +112,16 @@ DISTORTION = (
     ),
     *("coeffs", "coefficients", "distortioncoefficients1", "distcoeffs1", "d1"),
 )
-WIDTH = ("imagewidth", "width", "w")
-HEIGHT = ("imageheight", "height", "h")
-SIZE = ("imagesize", "resolution", "imageresolution")
+WIDTH_KEYS = ("imagewidth", "width", "w")
+HEIGHT_KEYS = ("imageheight", "height", "h")
+SIZE_KEYS = ("imagesize", "resolution", "imageresolution")
 # of camodocal (VINS)
-GROUPS = ("projection_parameters", "distortion_parameters", "mirror_parameters")
-KANNALA = {
+CAMODOCAL_GROUPS = (
+    "projection_parameters",
+    "distortion_parameters",
+    "mirror_parameters",
+)
+CAMODOCAL_FISHEYE_KEYS = {
     "mu": "fx",
     "mv": "fy",
     "u0": "cx",
@@ -128,12 +132,14 @@ KANNALA = {
     "k5": "k4",
 }
 """OpenCV's names of camodocal's parameters of a fisheye."""
-ALIKE = 0.01  # relative difference allowed between a focal length and an angle
-OF_A_FRAME = frozenset(
-    ("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", *IN_OPENCV)
+MAX_FOCAL_MISMATCH = (
+    0.01  # relative difference allowed between a focal length and an angle
+)
+LENS_KEYS = frozenset(
+    ("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", *OPENCV_COEFFICIENTS)
 )
 """Entries of nerfstudio about a camera, of all frames or of one."""
-OF_A_SCENE = frozenset(
+SCENE_KEYS = frozenset(
     "frames aabb_scale scale offset applied_transform applied_scale ply_file_path "
     "orientation_override "
     "auto_scale_poses_override train_filenames val_filenames test_filenames "
@@ -160,16 +166,16 @@ def read_camera(spec: str) -> CameraModel:
     """
     path, _, which = spec.partition("#")
     suffix = Path(path).suffix.lower()
-    if suffix in CAMERAS and Path(path).is_file():
+    if suffix in CAMERA_FORMAT_ADVICE and Path(path).is_file():
         raise FileFormatError(
-            f"{path}: expected a camera as text, got {CAMERAS[suffix]}"
+            f"{path}: expected a camera as text, got {CAMERA_FORMAT_ADVICE[suffix]}"
         )
     if suffix in MESHES:
         raise FileFormatError(
             f"{path}: expected a camera file, got a mesh; it is an "
             "object's, not a camera's"
         )
-    limit = LARGEST_JSON if suffix == ".json" else LARGEST
+    limit = MAX_JSON_SIZE if suffix == ".json" else LARGEST
     text = present_text(path, "a camera file", limit)
     lines = [
         line
@@ -177,14 +183,14 @@ def read_camera(spec: str) -> CameraModel:
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
-        return _of_colmap(spec, path, which, lines)
+        return _read_colmap(spec, path, which, lines)
     check_text_format(path, text)
-    data = _data(path, text)
+    data = _parse_file(path, text)
     translated = translate_entries(path, which, data)
     if translated is not None:
-        return _of_opencv(spec, Entries(path, translated))
+        return _read_opencv(spec, Entries(path, translated))
     if "frames" in data or "fl_x" in data or "camera_angle_x" in data:
-        return _of_nerfstudio(spec, which, data)
+        return _read_nerfstudio(spec, which, data)
     cameras = {
         name: entry
         for name, entry in data.items()
@@ -194,32 +200,34 @@ def read_camera(spec: str) -> CameraModel:
         rest = {name: entry for name, entry in data.items() if name not in cameras}
         unread = Entries(path, rest)
         camera = Entries(path, select_camera(path, which, cameras))
-        return _of_kalibr(spec, camera, unread.told())
+        return _read_kalibr(spec, camera, unread.find_unread())
     if which:
         raise FileFormatError(
             f"{path}: expected several cameras, as {which!r} is asked for, got one; "
             f"leave #{which} out"
         )
     if "intrinsics" in data and "camera_model" in data:
-        return _of_kalibr(spec, Entries(path, data))
-    return _of_opencv(spec, Entries(path, _without_groups(data)))
+        return _read_kalibr(spec, Entries(path, data))
+    return _read_opencv(spec, Entries(path, _flatten_groups(data)))
 
 
-def _without_groups(data: Mapping[str, Any]) -> dict[str, Any]:
+def _flatten_groups(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return entries with those of camodocal's groups on the top level."""
     groups = {
-        name: group for name in GROUPS if isinstance(group := data.get(name), dict)
+        name: group
+        for name in CAMODOCAL_GROUPS
+        if isinstance(group := data.get(name), dict)
     }
     entries = {name: value for name, value in data.items() if name not in groups}
     for group in groups.values():
-        names = KANNALA if "mu" in group else {}
+        names = CAMODOCAL_FISHEYE_KEYS if "mu" in group else {}
         entries |= {
             names.get(str(key), str(key)): value for key, value in group.items()
         }
     return entries
 
 
-def _data(path: str, text: str) -> dict[str, Any]:
+def _parse_file(path: str, text: str) -> dict[str, Any]:
     """Parse a camera file that is XML, JSON or YAML."""
     if text.lstrip().startswith("<"):
         return _parse_xml(path, text)
@@ -270,7 +278,9 @@ def _parse_xml(path: str, text: str) -> dict[str, Any]:
 # ---- Formats ----
 
 
-def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> CameraModel:
+def _read_colmap(
+    spec: str, path: str, camera_name: str, lines: Sequence[str]
+) -> CameraModel:
     """Return the model of a camera of COLMAP's cameras.txt."""
     rows = {words[0]: words for line in lines if (words := line.split())}
     if len(rows) < len(lines):
@@ -278,15 +288,15 @@ def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> Camera
             f"{path}: expected each camera once, got one with the same number twice; "
             "correct the file"
         )
-    _, name, *values = select_camera(path, which, rows)
-    if name not in COLMAP:
+    _, name, *values = select_camera(path, camera_name, rows)
+    if name not in COLMAP_MODELS:
         raise FileFormatError(
-            f"{path}: expected one of COLMAP's models {', '.join(COLMAP)}, got "
+            f"{path}: expected one of COLMAP's models {', '.join(COLMAP_MODELS)}, got "
             f"{name[:40]}, which is another projection"
             "; fit one of these to it (colmap model_converter does not), or undistort "
             "the pictures"
         )
-    kind, parameters = COLMAP[name]
+    kind, parameters = COLMAP_MODELS[name]
     keys = ["width", "height", *parameters.split()]
     if len(values) != len(keys):
         raise FileFormatError(
@@ -294,87 +304,92 @@ def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> Camera
             f"{len(values)} numbers; correct the line"
         )
     numbers = {
-        key: number(path, key, value) for key, value in zip(keys, values, strict=True)
+        key: parse_number(path, key, value)
+        for key, value in zip(keys, values, strict=True)
     }
     size = (numbers.pop("height"), numbers.pop("width"))
     if "f" in numbers:
         focal_length = numbers.pop("f")
         numbers["fy"] = focal_length
         numbers["fx"] = focal_length
-    return made(spec, kind, size, numbers)
+    return make_camera_model(spec, kind, size, numbers)
 
 
-def _of_nerfstudio(spec: str, which: str, data: Mapping[str, Any]) -> CameraModel:
+def _read_nerfstudio(
+    spec: str, camera_name: str, data: Mapping[str, Any]
+) -> CameraModel:
     """Return the model of a transforms.json, or of one of its frames."""
     path = spec.partition("#")[0]
     frames = data.get("frames") or []
     if not isinstance(frames, list):
         frames = []
     frames = [frame for frame in frames if isinstance(frame, dict)]
-    lens = _select_lens(path, which, frames)
+    lens = _select_lens(path, camera_name, frames)
     frame_rest = {}
     for frame in frames:
         for key, value in frame.items():
-            if key not in OF_A_FRAME | OF_A_SCENE:
+            if key not in LENS_KEYS | SCENE_KEYS:
                 frame_rest[key] = value
-    scene_entries = {key: value for key, value in data.items() if key not in OF_A_SCENE}
+    scene_entries = {key: value for key, value in data.items() if key not in SCENE_KEYS}
     entries = Entries(path, scene_entries | lens)
-    width = entries.number("w")
-    height = entries.number("h")
+    width = entries.get_number("w")
+    height = entries.get_number("h")
     name = str(entries.get("cameramodel") or "PINHOLE").upper()
-    if name not in (*COLMAP, "PERSPECTIVE"):
+    if name not in (*COLMAP_MODELS, "PERSPECTIVE"):
         raise FileFormatError(
-            f"{path}: expected one of the camera models {', '.join(COLMAP)}, got "
-            f"{shown(name)}, which is another "
+            f"{path}: expected one of the camera models {', '.join(COLMAP_MODELS)}, got "
+            f"{format_name(name)}, which is another "
             "projection; fit one of these to it"
         )
-    kind = COLMAP[name][0] if name in COLMAP else BROWN_CONRADY
+    kind = COLMAP_MODELS[name][0] if name in COLMAP_MODELS else BROWN_CONRADY
     if entries.get("isfisheye"):
         kind = FISHEYE
-    x_focal = _focal_of_angle(path, data.get("camera_angle_x"), width)
-    y_focal = _focal_of_angle(path, data.get("camera_angle_y"), height)
-    fx = entries.number("fl_x", x_focal or None)
-    if x_focal and abs(fx - x_focal) > ALIKE * fx:
+    x_focal = _compute_focal_length(path, data.get("camera_angle_x"), width)
+    y_focal = _compute_focal_length(path, data.get("camera_angle_y"), height)
+    fx = entries.get_number("fl_x", x_focal or None)
+    if x_focal and abs(fx - x_focal) > MAX_FOCAL_MISMATCH * fx:
         raise FileFormatError(
             f"{path}: fl_x: expected {x_focal:g}, as camera_angle_x says, got {fx:g}; "
             "leave one out"
         )
-    numbers = {"fx": fx, "fy": entries.number("fl_y", y_focal or fx)}
-    numbers["cx"] = entries.number("cx", width / 2.0)
-    numbers["cy"] = entries.number("cy", height / 2.0)
+    numbers = {"fx": fx, "fy": entries.get_number("fl_y", y_focal or fx)}
+    numbers["cx"] = entries.get_number("cx", width / 2.0)
+    numbers["cy"] = entries.get_number("cy", height / 2.0)
     names: Sequence[str] = ("k1", "k2", "k3", "p1", "p2")
     if kind == FISHEYE:
         names = COEFFICIENTS[:4]
-    numbers |= _coefficients(entries, names)
-    model = made(spec, kind, (height, width), numbers)
-    unread = [*entries.told(), *Entries(path, frame_rest).told("frames.")]
-    return with_told(model, unread)
+    numbers |= _read_coefficients(entries, names)
+    model = make_camera_model(spec, kind, (height, width), numbers)
+    unread = [*entries.find_unread(), *Entries(path, frame_rest).find_unread("frames.")]
+    return add_notes(model, unread)
 
 
 def _select_lens(
-    path: str, which: str, frames: Sequence[Mapping[str, Any]]
+    path: str, camera_name: str, frames: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
     """Return the entries about the lens of a frame, or those that all frames share."""
     lenses = [
-        {key: frame[key] for key in frame if key in OF_A_FRAME} for frame in frames
+        {key: frame[key] for key in frame if key in LENS_KEYS} for frame in frames
     ] or [{}]
     first: dict[str, Any] = lenses[0]
-    if not which and all(lens == first for lens in lenses):
+    if not camera_name and all(lens == first for lens in lenses):
         return first
     by_index = {str(index): lens for index, lens in enumerate(lenses)}
-    selected: dict[str, Any] = select_camera(path, which, by_index)
+    selected: dict[str, Any] = select_camera(path, camera_name, by_index)
     return selected
 
 
-def _focal_of_angle(path: str, angle: object, side: float) -> float:
+def _compute_focal_length(path: str, angle: object, side: float) -> float:
     """Return the focal length in pixels of a field of view in radians; 0 for None."""
     if angle is None:
         return 0.0
-    half_angle = number(path, "camera_angle", angle) / 2.0
+    half_angle = parse_number(path, "camera_angle", angle) / 2.0
     return side / 2.0 / max(math.tan(half_angle), 1e-9)
 
 
-def _of_kalibr(spec: str, entries: Entries, unread: Sequence[str] = ()) -> CameraModel:
+def _read_kalibr(
+    spec: str, entries: Entries, unread: Sequence[str] = ()
+) -> CameraModel:
     """Return the model of a camera of Kalibr; `unread` are other entries of its file."""
     path = entries.path
     model = str(entries.get("cameramodel") or "pinhole")
@@ -387,29 +402,36 @@ def _of_kalibr(spec: str, entries: Entries, unread: Sequence[str] = ()) -> Camer
             f"{path}: expected the camera_model pinhole of Kalibr, got {model[:40]}"
             f"{advice}"
         )
-    kind = _kind(path, entries.get("distortionmodel"))
-    intrinsics = entries.numbers("intrinsics", entries.get("intrinsics"), (4,))
+    kind = _find_kind(path, entries.get("distortionmodel"))
+    intrinsics = entries.parse_numbers("intrinsics", entries.get("intrinsics"), (4,))
     names = ("k1", "k2", "k3", "k4") if kind == FISHEYE else ("k1", "k2", "p1", "p2")
-    width, height = entries.numbers("resolution", entries.there("resolution"), (2,))
-    numbers = _distortion(entries, names, (0, 4))
+    width, height = entries.parse_numbers(
+        "resolution", entries.require("resolution"), (2,)
+    )
+    numbers = _read_distortion(entries, names, (0, 4))
     numbers |= zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True)
-    camera = made(spec, kind, (height, width), numbers, 0.5)
-    return with_told(camera, [*unread, *entries.told()])
+    camera = make_camera_model(spec, kind, (height, width), numbers, 0.5)
+    return add_notes(camera, [*unread, *entries.find_unread()])
 
 
-def _of_opencv(spec: str, entries: Entries) -> CameraModel:
+def _read_opencv(spec: str, entries: Entries) -> CameraModel:
     """Return the model of a camera of OpenCV or ROS."""
     path = entries.path
-    kind = _opencv_kind(path, entries)
+    kind = _find_opencv_kind(path, entries)
     if kind == EQUIRECTANGULAR:
-        return with_told(made(spec, kind, _size(entries), {}), entries.told())
-    matrix = _camera_matrix(path, entries)
-    height, width = _size(entries)
+        return add_notes(
+            make_camera_model(spec, kind, _read_size(entries), {}),
+            entries.find_unread(),
+        )
+    matrix = _read_camera_matrix(path, entries)
+    height, width = _read_size(entries)
     unread = _check_roi(entries, (height, width))
     if kind == FISHEYE:
-        numbers = _distortion(entries, COEFFICIENTS[:4], (0, 4))
+        numbers = _read_distortion(entries, COEFFICIENTS[:4], (0, 4))
     else:
-        numbers = _distortion(entries, IN_OPENCV, LENGTHS)
+        numbers = _read_distortion(
+            entries, OPENCV_COEFFICIENTS, OPENCV_COEFFICIENT_COUNTS
+        )
     if numbers.pop("tauX", 0.0) or numbers.pop("tauY", 0.0):
         raise FileFormatError(
             f"{path}: expected no tilt of the sensor (tauX, tauY), got one; calibrate "
@@ -422,21 +444,23 @@ def _of_opencv(spec: str, entries: Entries) -> CameraModel:
         "fy": matrix[4],
         "cy": matrix[5],
     }
-    y_binning, x_binning = _binning(entries)
+    y_binning, x_binning = _read_binning(entries)
     binned_size = (height - height % y_binning, width - width % x_binning)
-    model = made(spec, kind, binned_size, numbers, 0.5)
+    model = make_camera_model(spec, kind, binned_size, numbers, 0.5)
     model = replace(model, size=(int(height // y_binning), int(width // x_binning)))
-    rectified = _rectified(entries, matrix)
-    return with_told(model, unread + entries.told(), rectified)
+    rectified = _find_rectified(entries, matrix)
+    return add_notes(model, unread + entries.find_unread(), rectified)
 
 
-def _opencv_kind(path: str, entries: Entries) -> str:
+def _find_opencv_kind(path: str, entries: Entries) -> str:
     """Return the kind of model that a camera of OpenCV or ROS states."""
     keys = ("distortionmodel", "cameramodel", "modeltype")
     kinds = {
-        _kind(path, model) for key in keys if (model := entries.get(key)) is not None
+        _find_kind(path, model)
+        for key in keys
+        if (model := entries.get(key)) is not None
     }
-    is_fisheye = not nothing(entries.get("fisheyemodel"))
+    is_fisheye = not is_neutral(entries.get("fisheyemodel"))
     if len(kinds) > 1:
         raise FileFormatError(
             f"{path}: expected one model, got a camera_model beside "
@@ -445,14 +469,14 @@ def _opencv_kind(path: str, entries: Entries) -> str:
     return FISHEYE if is_fisheye else next(iter(kinds), BROWN_CONRADY)
 
 
-def _camera_matrix(path: str, entries: Entries) -> list[float]:
+def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
     """Return the camera matrix, nine numbers row by row."""
-    if entries.get(*MATRIX) is None and entries.get("fx") is not None:
-        fx, fy, cx, cy = (entries.number(name) for name in ("fx", "fy", "cx", "cy"))
+    if entries.get(*CAMERA_MATRIX_KEYS) is None and entries.get("fx") is not None:
+        fx, fy, cx, cy = (entries.get_number(name) for name in ("fx", "fy", "cx", "cy"))
         matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     else:
-        matrix = entries.numbers(
-            "camera_matrix", entries.there("camera_matrix", MATRIX), (9,)
+        matrix = entries.parse_numbers(
+            "camera_matrix", entries.require("camera_matrix", CAMERA_MATRIX_KEYS), (9,)
         )
     if not any(matrix):
         raise FileFormatError(
@@ -471,7 +495,7 @@ def _camera_matrix(path: str, entries: Entries) -> list[float]:
     return matrix
 
 
-def _distortion(
+def _read_distortion(
     entries: Entries, names: Sequence[str], counts: Sequence[int]
 ) -> dict[str, float]:
     """Return the distortion coefficients, from a list or from single entries.
@@ -481,11 +505,11 @@ def _distortion(
         names: the coefficients in the order of the list.
         counts: the lengths that the list may have.
     """
-    listing = entries.get(*DISTORTION)
-    if nothing(listing) and not isinstance(listing, Mapping):
-        coefficients = _coefficients(entries, names)
+    listing = entries.get(*DISTORTION_KEYS)
+    if is_neutral(listing) and not isinstance(listing, Mapping):
+        coefficients = _read_coefficients(entries, names)
     else:
-        values = entries.numbers("distortion_coefficients", listing, counts)
+        values = entries.parse_numbers("distortion_coefficients", listing, counts)
         coefficients = dict(zip(names, values, strict=False))
     model = entries.get("distortionmodel")
     is_none = isinstance(model, str) and model.strip().lower() == "none"
@@ -497,11 +521,11 @@ def _distortion(
     return coefficients
 
 
-def _coefficients(entries: Entries, names: Sequence[str]) -> dict[str, float]:
-    return {name: entries.number(name, 0.0) for name in names}
+def _read_coefficients(entries: Entries, names: Sequence[str]) -> dict[str, float]:
+    return {name: entries.get_number(name, 0.0) for name in names}
 
 
-def _rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
+def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
     """Return the names of matrices of rectified images that differ from the camera's."""
     fx, skew, cx, _, fy, cy = matrix[:6]
     differing = []
@@ -509,10 +533,10 @@ def _rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
         ("rectification_matrix", "r", [1.0, 0, 0, 0, 1, 0, 0, 0, 1]),
         ("projection_matrix", "p", [fx, skew, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]),
     ):
-        value = entries.get(plain(name), short_name)
-        if nothing(value):
+        value = entries.get(normalize_key(name), short_name)
+        if is_neutral(value):
             continue
-        numbers = entries.numbers(name, value, (len(expected),))
+        numbers = entries.parse_numbers(name, value, (len(expected),))
         if any(
             abs(a - b) > 1e-6 * max(1.0, abs(b))
             for a, b in zip(numbers, expected, strict=True)
@@ -530,7 +554,7 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
     if not isinstance(value, Mapping):
         value = {}
     roi = Entries(entries.path, {str(key): value[key] for key in value})
-    numbers = _coefficients(roi, ("x_offset", "y_offset", "height", "width"))
+    numbers = _read_coefficients(roi, ("x_offset", "y_offset", "height", "width"))
     x, y, height, width = numbers.values()
     roi.get("dorectify")
     if (x, y) != (0.0, 0.0) or (height, width) not in ((0.0, 0.0), size):
@@ -538,44 +562,44 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
             f"{entries.path}: expected a camera_info of whole pictures, got one of a "
             "part (roi); set it to 0"
         )
-    return roi.told("roi.")
+    return roi.find_unread("roi.")
 
 
-def _kind(path: str, model: object) -> str:
+def _find_kind(path: str, model: object) -> str:
     """Return the kind of a distortion model by the name that a tool gives it."""
     name = re.sub(r"[-\s]", "_", str(model or "").strip().lower())
     if name == "pinhole":
         return BROWN_CONRADY
-    if name not in OF_DISTORTION:
+    if name not in KIND_OF_DISTORTION:
         advice = describe_projection(name) or "; calibrate with one of these"
         raise FileFormatError(
             f"{path}: expected one of the distortion models "
-            f"{', '.join(filter(None, OF_DISTORTION))}, got {name[:40]!r}{advice}"
+            f"{', '.join(filter(None, KIND_OF_DISTORTION))}, got {name[:40]!r}{advice}"
         )
-    return OF_DISTORTION[name]
+    return KIND_OF_DISTORTION[name]
 
 
-def _size(entries: Entries) -> tuple[float, float]:
+def _read_size(entries: Entries) -> tuple[float, float]:
     """Return the height and width of the image in pixels."""
-    size = entries.get(*SIZE)
+    size = entries.get(*SIZE_KEYS)
     if size is not None:
-        width, height = entries.numbers("image_size", size, (2,))
+        width, height = entries.parse_numbers("image_size", size, (2,))
         return height, width
-    width = entries.number("image_width", names=WIDTH)
-    return entries.number("image_height", names=HEIGHT), width
+    width = entries.get_number("image_width", aliases=WIDTH_KEYS)
+    return entries.get_number("image_height", aliases=HEIGHT_KEYS), width
 
 
-def _binning(entries: Entries) -> tuple[float, float]:
+def _read_binning(entries: Entries) -> tuple[float, float]:
     """Return how many pixels ROS bins into one, along y and x.
 
     The calibration is that of the pixels before.
     """
-    y_binning = entries.number("binning_y", 1.0) or 1.0
-    x_binning = entries.number("binning_x", 1.0) or 1.0
+    y_binning = entries.get_number("binning_y", 1.0) or 1.0
+    x_binning = entries.get_number("binning_x", 1.0) or 1.0
     for name, pixels in (("binning_y", y_binning), ("binning_x", x_binning)):
-        if pixels != int(pixels) or not 1 <= pixels <= MOST_BINNED:
+        if pixels != int(pixels) or not 1 <= pixels <= MAX_BINNING:
             raise FileFormatError(
-                f"{entries.path}: {name}: expected a whole number up to {MOST_BINNED}, "
+                f"{entries.path}: {name}: expected a whole number up to {MAX_BINNING}, "
                 f"got {pixels:g}"
             )
     return y_binning, x_binning

@@ -37,21 +37,26 @@ from advsearch.errors import InputError
 BROWN_CONRADY = "brown-conrady"
 FISHEYE = "fisheye"
 EQUIRECTANGULAR = "equirectangular"
-LINEAR = ("fx", "fy", "cx", "cy", "skew")
+LINEAR_PARAMETERS = ("fx", "fy", "cx", "cy", "skew")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-NUMBERS = (*LINEAR, *COEFFICIENTS)  # names of the numbers of a model, in order
-OF_KIND: Mapping[str, tuple[str, ...]] = {
+NUMBER_NAMES = (
+    *LINEAR_PARAMETERS,
+    *COEFFICIENTS,
+)  # names of the numbers of a model, in order
+COEFFICIENTS_OF_KIND: Mapping[str, tuple[str, ...]] = {
     BROWN_CONRADY: COEFFICIENTS,
     FISHEYE: COEFFICIENTS[:4],
     EQUIRECTANGULAR: (),
 }
 """The coefficients that each kind of model has."""
 # Limit of the steps of an inversion; nearly all converge in five.
-STEPS = 60
+MAX_STEPS = 60
 TOLERANCE = 1e-10  # distance, in focal lengths, under which an inversion has converged
-WIDEST = math.tan(math.radians(80.0))  # tangent of the widest half angle that is framed
-FAR = 1e6  # limit of the tangents of rays
-Field = Callable[[Tensor], Tensor]
+MAX_TANGENT = math.tan(
+    math.radians(80.0)
+)  # tangent of the widest half angle that is framed
+MAX_RAY_TANGENT = 1e6  # limit of the tangents of rays
+VectorFunction = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ class CameraModel:
     """Intrinsics and distortion of a camera."""
 
     kind: str  # `BROWN_CONRADY`, `FISHEYE` or `EQUIRECTANGULAR`
-    # (17,) in the order of `NUMBERS`: fx, cx and skew in image widths, fy and cy in
+    # (17,) in the order of `NUMBER_NAMES`: fx, cx and skew in image widths, fy and cy in
     # image heights, the coefficients.
     numbers: tuple[float, ...]
     # The user's name for it: a file, or a bundled model; empty if `camera.fov` sets its
@@ -67,22 +72,22 @@ class CameraModel:
     name: str = ""
     # (height, width) in pixels that it was calibrated for; None for any.
     size: tuple[int, int] | None = None
-    reach: float = 180.0  # largest angle to the axis that it sees, degrees
-    told: tuple[str, ...] = ()  # sentences about how its file was read
+    max_angle: float = 180.0  # largest angle to the axis that it sees, degrees
+    reading_notes: tuple[str, ...] = ()  # sentences about how its file was read
 
     @property
     def values(self) -> dict[str, float]:
-        return dict(zip(NUMBERS, self.numbers, strict=True))
+        return dict(zip(NUMBER_NAMES, self.numbers, strict=True))
 
     def with_numbers(self, numbers: Tensor) -> CameraModel:
         return replace(self, numbers=tuple(numbers.double().tolist()))
 
-    def check_given(self, given: Iterable[str]) -> None:
+    def check_no_fov(self, setting_names: Iterable[str]) -> None:
         """Raise InputError if settings of a scene contain a field of view.
 
         The camera has its own focal lengths.
         """
-        if "camera.fov" in given:
+        if "camera.fov" in setting_names:
             raise InputError(
                 f"`camera={self.name}` and `set` camera.fov contradict each other: the "
                 "camera has focal lengths of its "
@@ -106,22 +111,22 @@ class CameraModel:
         if self.kind == FISHEYE:
             distance = torch.hypot(x, y)
             angle = torch.atan2(distance, z)
-            scale = self._radial(angle) / distance.clamp_min(1e-300)
-            is_visible = angle <= self._last
+            scale = self._distort_radius(angle) / distance.clamp_min(1e-300)
+            is_visible = angle <= self._max_visible
             distorted = torch.stack([x * scale, y * scale], dim=-1)
         else:
             depth = torch.where(z > 0.0, z, torch.ones_like(z))
             undistorted = torch.stack([x / depth, y / depth], dim=-1)
             radius = undistorted.norm(dim=-1)
-            is_visible = (z > 0.0) & (radius <= self._last)
-            distorted = self._bent(undistorted)
-        (fx, fy, cx, cy, skew) = self.numbers[: len(LINEAR)]
+            is_visible = (z > 0.0) & (radius <= self._max_visible)
+            distorted = self._distort(undistorted)
+        (fx, fy, cx, cy, skew) = self.numbers[: len(LINEAR_PARAMETERS)]
         (x, y) = distorted.unbind(dim=-1)
         column = fx * x + skew * y + cx
         row = fy * y + cy
         return torch.stack([column, row], dim=-1), is_visible
 
-    def rays(self, places: Tensor) -> tuple[Tensor, Tensor]:
+    def compute_rays(self, image_points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rays of image coordinates (N, 2).
 
         They are found by Newton's method, kept within bounds by bisection, and checked:
@@ -133,74 +138,80 @@ class CameraModel:
             with z = 1; and a margin (N,) float64, positive inside the view, which
             changes its sign along the edge of it.
         """
-        u, v = places.double().unbind(dim=-1)
+        u, v = image_points.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
             return _panorama_directions(u, v), torch.ones_like(u)
         distorted = self._to_distorted(u, v)
         radius = distorted.norm(dim=-1)
         direction_2d = distorted / radius.clamp_min(1e-300)[..., None]
-        bound = min(self._last, FAR)
-        max_radius = float(self._radial(torch.tensor([bound], dtype=torch.float64)))
+        bound = min(self._max_visible, MAX_RAY_TANGENT)
+        max_radius = float(
+            self._distort_radius(torch.tensor([bound], dtype=torch.float64))
+        )
         if self.kind == FISHEYE:
             # Beyond its circle too, for the edge of the view.
-            angle, converged = self._inverted(radius, min(self.fold, math.pi))
+            angle, converged = self._invert_radial(
+                radius, min(self.fold_angle, math.pi)
+            )
             directions = torch.cat(
                 [direction_2d * angle.sin()[..., None], angle.cos()[..., None]], dim=-1
             )
-            return directions, _inside(max_radius - radius, converged)
-        start, converged = self._inverted(radius, bound)
+            return directions, _clip_margin(max_radius - radius, converged)
+        start, converged = self._invert_radial(radius, bound)
         undistorted = direction_2d * start[..., None]
-        has_decentering = any(self.numbers[NUMBERS.index("p1") :])
+        has_decentering = any(self.numbers[NUMBER_NAMES.index("p1") :])
         if has_decentering:
-            undistorted, converged = self._newton(undistorted, distorted, bound)
-            radius = (distorted - self._decentred(undistorted)).norm(dim=-1)
+            undistorted, converged = self._invert_distortion(
+                undistorted, distorted, bound
+            )
+            radius = (distorted - self._compute_decentering(undistorted)).norm(dim=-1)
         directions = torch.cat(
             [undistorted, torch.ones_like(undistorted[..., :1])], dim=-1
         )
-        return directions, _inside(max_radius - radius, converged)
+        return directions, _clip_margin(max_radius - radius, converged)
 
     def _to_distorted(self, u: Tensor, v: Tensor) -> Tensor:
-        """Return distorted points (N, 2) at image coordinates (N,): invert `LINEAR`."""
-        fx, fy, cx, cy, skew = self.numbers[: len(LINEAR)]
+        """Return distorted points (N, 2) at image coordinates (N,): invert `LINEAR_PARAMETERS`."""
+        fx, fy, cx, cy, skew = self.numbers[: len(LINEAR_PARAMETERS)]
         y = (v - cy) / fy
         return torch.stack([(u - cx - skew * y) / fx, y], dim=-1)
 
-    def table(self, places: Tensor) -> Tensor:
+    def make_ray_table(self, image_points: Tensor) -> Tensor:
         """Return rays of image coordinates (N, 2) in the axes of Mitsuba's cameras.
 
         The result is (N, 4) float32: directions to the left, up and ahead, and the
         margin of `rays`, positive inside the view.
         """
-        directions, margin = self.rays(places)
+        directions, margin = self.compute_rays(image_points)
         return torch.cat(
             [directions * torch.tensor([-1.0, -1.0, 1.0]), margin[:, None]], dim=-1
         ).float()
 
-    def _inverted(self, wanted: Tensor, high: float) -> tuple[Tensor, Tensor]:
+    def _invert_radial(self, target: Tensor, max_value: float) -> tuple[Tensor, Tensor]:
         """Solve radial(x) = wanted for x within [0, high], where radial grows.
 
         Newton's method, with bisection if a step leaves the bracket.
 
         Args:
-            wanted: (N,) distorted radii.
-            high: upper bound of the solutions.
+            target: (N,) distorted radii.
+            max_value: upper bound of the solutions.
 
         Returns:
             The solutions (N,), and which of them have converged.
         """
-        bound = min(1.0, high)
-        while bound < high and float(
-            self._radial(torch.tensor(bound, dtype=torch.float64))
-        ) < float(wanted.max()):
-            bound = min(2.0 * bound, high)
-        lower = torch.zeros_like(wanted)
-        upper = torch.full_like(wanted, bound)
-        radius = torch.minimum(wanted, upper)
-        for _ in range(STEPS):
-            values, (slope,) = _with_slopes(
-                lambda radii: self._radial(radii)[..., None], radius
+        bound = min(1.0, max_value)
+        while bound < max_value and float(
+            self._distort_radius(torch.tensor(bound, dtype=torch.float64))
+        ) < float(target.max()):
+            bound = min(2.0 * bound, max_value)
+        lower = torch.zeros_like(target)
+        upper = torch.full_like(target, bound)
+        radius = torch.minimum(target, upper)
+        for _ in range(MAX_STEPS):
+            values, (slope,) = _evaluate_with_jacobian(
+                lambda radii: self._distort_radius(radii)[..., None], radius
             )
-            error = values[..., 0] - wanted
+            error = values[..., 0] - target
             is_solved = (error.abs() <= TOLERANCE) | (upper - lower <= TOLERANCE)
             if bool(is_solved.all()):
                 break
@@ -209,29 +220,29 @@ class CameraModel:
             step = radius - error / slope
             is_within = (step > lower) & (step < upper)
             radius = torch.where(is_within, step, (lower + upper) / 2.0)
-        error = (self._radial(radius) - wanted).abs()
-        return radius, error <= 1e3 * TOLERANCE * (1.0 + wanted)
+        error = (self._distort_radius(radius) - target).abs()
+        return radius, error <= 1e3 * TOLERANCE * (1.0 + target)
 
-    def _newton(
-        self, undistorted: Tensor, distorted: Tensor, high: float
+    def _invert_distortion(
+        self, undistorted: Tensor, distorted: Tensor, max_radius: float
     ) -> tuple[Tensor, Tensor]:
         """Solve distort(x) = distorted by Newton's method in two dimensions.
 
         Args:
             undistorted: (N, 2) where it starts.
             distorted: (N, 2).
-            high: largest radius of a solution.
+            max_radius: largest radius of a solution.
 
         Returns:
             The solutions (N, 2); and which have converged before the lens folds.
         """
         converged = torch.zeros_like(undistorted[..., 0], dtype=torch.bool)
-        for _ in range(STEPS // 3):
-            values, rows = _with_slopes(self._bent, undistorted)
+        for _ in range(MAX_STEPS // 3):
+            values, rows = _evaluate_with_jacobian(self._distort, undistorted)
             error = values - distorted
             (a, b), (c, d) = (row.unbind(dim=-1) for row in rows)
             determinant = a * d - b * c
-            is_inside = (determinant > 0.0) & (undistorted.norm(dim=-1) < high)
+            is_inside = (determinant > 0.0) & (undistorted.norm(dim=-1) < max_radius)
             converged = is_inside & (
                 error.norm(dim=-1) <= TOLERANCE * (1.0 + distorted.norm(dim=-1))
             )
@@ -248,7 +259,7 @@ class CameraModel:
             radius = updated.norm(dim=-1, keepdim=True)
             updated = torch.where(
                 torch.isfinite(radius),
-                updated * (high / radius.clamp_min(high)),
+                updated * (max_radius / radius.clamp_min(max_radius)),
                 undistorted,
             )
             undistorted = torch.where(converged[..., None], undistorted, updated)
@@ -259,13 +270,13 @@ class CameraModel:
     @cached_property
     def _polynomials(self) -> tuple[Polynomial, Polynomial]:
         """Numerator and denominator of radial(r) / r, as polynomials in r^2."""
-        k = self.numbers[len(LINEAR) :]
+        k = self.numbers[len(LINEAR_PARAMETERS) :]
         if self.kind == FISHEYE:
             return Polynomial([1.0, *k[:4]]), Polynomial([1.0])
         return Polynomial([1.0, *k[:3]]).trim(), Polynomial([1.0, *k[3:6]]).trim()
 
     @cached_property
-    def fold(self) -> float:
+    def fold_angle(self) -> float:
         """Angle to the axis, radians, at which the radial distortion turns back.
 
         It is infinite if it never does. Beyond it two directions have one image point,
@@ -285,34 +296,34 @@ class CameraModel:
         return radius if self.kind == FISHEYE else math.atan(radius)
 
     @cached_property
-    def _last(self) -> float:
+    def _max_visible(self) -> float:
         """The largest visible angle of a fisheye, or tangent of another lens."""
         if self.kind == FISHEYE:
-            return min(self.fold, math.radians(self.reach), math.pi)
-        if self.fold < math.pi / 2.0:
-            return math.tan(self.fold) * (1.0 - 1e-9)
+            return min(self.fold_angle, math.radians(self.max_angle), math.pi)
+        if self.fold_angle < math.pi / 2.0:
+            return math.tan(self.fold_angle) * (1.0 - 1e-9)
         return math.inf
 
-    def _scale(self, square: Tensor) -> Tensor:
+    def _radial_scale(self, square: Tensor) -> Tensor:
         """Return radial(r) / r at r^2."""
         numerator, denominator = self._polynomials
-        value = _evaluated(numerator, square)
+        value = _evaluate_polynomial(numerator, square)
         if len(denominator) == 1:
             return value
-        return value / _evaluated(denominator, square)
+        return value / _evaluate_polynomial(denominator, square)
 
-    def _radial(self, radius: Tensor) -> Tensor:
+    def _distort_radius(self, radius: Tensor) -> Tensor:
         """Return the radial distortion of radii."""
-        return radius * self._scale(radius * radius)
+        return radius * self._radial_scale(radius * radius)
 
-    def _bent(self, undistorted: Tensor) -> Tensor:
+    def _distort(self, undistorted: Tensor) -> Tensor:
         """Return distorted points of undistorted ones (N, 2)."""
-        scale = self._scale(undistorted.square().sum(dim=-1))
-        return undistorted * scale[..., None] + self._decentred(undistorted)
+        scale = self._radial_scale(undistorted.square().sum(dim=-1))
+        return undistorted * scale[..., None] + self._compute_decentering(undistorted)
 
-    def _decentred(self, undistorted: Tensor) -> Tensor:
+    def _compute_decentering(self, undistorted: Tensor) -> Tensor:
         """Return the tangential and thin prism distortion of points (N, 2)."""
-        (p1, p2, s1, s2, s3, s4) = self.numbers[NUMBERS.index("p1") :]
+        (p1, p2, s1, s2, s3, s4) = self.numbers[NUMBER_NAMES.index("p1") :]
         (x, y) = undistorted.unbind(dim=-1)
         square = x * x + y * y
         x_shift = (
@@ -326,12 +337,12 @@ class CameraModel:
     # ---- Derived properties ----
 
     @cached_property
-    def tangents(self) -> tuple[float, float]:
+    def visible_tangents(self) -> tuple[float, float]:
         """Half the sides, as tangents, of a rectangle around the axis inside the image.
 
         The rectangle is completely visible.
         """
-        edges = self._edge_tangents()
+        edges = self._compute_edge_tangents()
         grid = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
         edge = torch.ones_like(grid)
         rim = torch.stack(
@@ -352,7 +363,7 @@ class CameraModel:
                 break
         return fraction * edges[0], fraction * edges[1]
 
-    def _edge_tangents(self) -> list[float]:
+    def _compute_edge_tangents(self) -> list[float]:
         """Return the tangents at which the image ends along x and along y.
 
         Along the row and the column through the axis, the nearer of both edges counts.
@@ -366,7 +377,7 @@ class CameraModel:
                 line[:, axis] = torch.linspace(
                     float(center[0, axis]), border, 512, dtype=torch.float64
                 )
-                directions, margin = self.rays(line)
+                directions, margin = self.compute_rays(line)
                 is_visible = (margin > 0.0) & (directions[:, 2] > 0.1)
                 tangent = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
                 tangents.append(
@@ -376,34 +387,34 @@ class CameraModel:
                         ).max()
                     )
                 )
-            edges.append(max(1e-3, min(WIDEST, *tangents)))
+            edges.append(max(1e-3, min(MAX_TANGENT, *tangents)))
         return edges
 
     @cached_property
-    def black(self) -> float:
+    def black_fraction(self) -> float:
         """Fraction of the image in which nothing is visible."""
         step = (torch.arange(64, dtype=torch.float64) + 0.5) / 64
         grid = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1)
-        _, margin = self.rays(grid.reshape(-1, 2))
+        _, margin = self.compute_rays(grid.reshape(-1, 2))
         return float((margin <= 0.0).double().mean())
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know about the camera, in sentences."""
-        if self.black == 0.0:
-            return self.told
+        if self.black_fraction == 0.0:
+            return self.reading_notes
         name = self.name or "the lens"
-        black_part = f"{100.0 * self.black:.2g} % of the picture"
+        black_part = f"{100.0 * self.black_fraction:.2g} % of the picture"
         sentence = f"{name}: {black_part} lies outside the lens's circle and is black."
-        if self.fold < math.radians(self.reach):
+        if self.fold_angle < math.radians(self.max_angle):
             sentence = (
-                f"{name}: the lens folds at {math.degrees(self.fold):.1f} degrees "
+                f"{name}: the lens folds at {math.degrees(self.fold_angle):.1f} degrees "
                 f"from its axis, and {black_part}, which only directions beyond that "
                 "would fill, is black."
             )
-        return (*self.told, sentence)
+        return (*self.reading_notes, sentence)
 
-    def scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
+    def describe_scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
         """Return a note if an image has another size (height, width) than the model."""
         if self.size is None or self.size == resolution:
             return ()
@@ -422,7 +433,7 @@ class CameraModel:
         )
 
 
-def pinhole(fov: float, aspect: float) -> CameraModel:
+def make_pinhole(fov: float, aspect: float) -> CameraModel:
     """Return the model of a camera without distortion.
 
     Args:
@@ -434,7 +445,7 @@ def pinhole(fov: float, aspect: float) -> CameraModel:
     return CameraModel(BROWN_CONRADY, (*linear, *[0.0] * len(COEFFICIENTS)))
 
 
-def bundled(aspect: float = 1.0) -> Mapping[str, CameraModel]:
+def make_bundled_models(aspect: float = 1.0) -> Mapping[str, CameraModel]:
     """Return the models that need no file, by name, for an aspect ratio (w / h)."""
     focal = 1.0 / math.pi
     no_distortion = [0.0] * len(COEFFICIENTS)
@@ -448,7 +459,7 @@ def bundled(aspect: float = 1.0) -> Mapping[str, CameraModel]:
     )
     panorama = (1.0, 1.0, 0.5, 0.5, 0.0, *no_distortion)
     return {
-        FISHEYE: CameraModel(FISHEYE, fisheye, FISHEYE, reach=90.0),
+        FISHEYE: CameraModel(FISHEYE, fisheye, FISHEYE, max_angle=90.0),
         EQUIRECTANGULAR: CameraModel(EQUIRECTANGULAR, panorama, EQUIRECTANGULAR),
     }
 
@@ -472,7 +483,7 @@ def _panorama_directions(u: Tensor, v: Tensor) -> Tensor:
     )
 
 
-def _evaluated(polynomial: Polynomial, x: Tensor) -> Tensor:
+def _evaluate_polynomial(polynomial: Polynomial, x: Tensor) -> Tensor:
     """Evaluate a polynomial by Horner's method."""
     value = torch.full_like(x, float(polynomial.coef[-1]))
     for coefficient in polynomial.coef[-2::-1]:
@@ -480,7 +491,9 @@ def _evaluated(polynomial: Polynomial, x: Tensor) -> Tensor:
     return value
 
 
-def _with_slopes(function: Field, at: Tensor) -> tuple[Tensor, list[Tensor]]:
+def _evaluate_with_jacobian(
+    function: VectorFunction, at: Tensor
+) -> tuple[Tensor, list[Tensor]]:
     """Evaluate a function that maps each of N points separately, and differentiate it.
 
     Returns:
@@ -496,7 +509,7 @@ def _with_slopes(function: Field, at: Tensor) -> tuple[Tensor, list[Tensor]]:
     return values.detach(), slopes
 
 
-def _inside(margin: Tensor, converged: Tensor) -> Tensor:
+def _clip_margin(margin: Tensor, converged: Tensor) -> Tensor:
     """Return margins clipped to 1, below zero if an inversion has not converged."""
     return torch.where(
         converged | (margin <= 0.0), margin, torch.full_like(margin, -1e-6)

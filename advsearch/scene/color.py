@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Values = TypeVar("Values", npt.NDArray[np.float32], "Tensor")
-LOW_END = 0.0031308  # linear values up to which the encoding is straight
+LINEAR_LIMIT = 0.0031308  # linear values up to which the encoding is straight
 
 
 def srgb_to_linear(display: Values) -> Values:
@@ -38,15 +38,15 @@ def linear_to_srgb(linear: Values) -> Values:
     Any shape, float32; differentiable.
     """
     clipped = linear.clip(0.0, 1.0)
-    low_end = clipped <= LOW_END
+    low_end = clipped <= LINEAR_LIMIT
     low = clipped * 12.92
-    curve = 1.055 * clipped.clip(LOW_END, None) ** (1.0 / 2.4) - 0.055
+    curve = 1.055 * clipped.clip(LINEAR_LIMIT, None) ** (1.0 / 2.4) - 0.055
     if isinstance(linear, np.ndarray):
         return np.where(low_end, low, curve).astype(np.float32)
     return low.where(low_end, curve)
 
 
-def levels_of(display: Tensor) -> Tensor:
+def to_uint8(display: Tensor) -> Tensor:
     """Return the levels (uint8) of values in [0, 1] in an 8-bit file.
 
     Not differentiable.
@@ -54,7 +54,7 @@ def levels_of(display: Tensor) -> Tensor:
     return (display.detach() * 255.0).round().byte()
 
 
-def to_8_bit(display: Tensor) -> Tensor:
+def round_to_8_bit(display: Tensor) -> Tensor:
     """Round values in [0, 1] to the 256 levels of an 8-bit file.
 
     Not differentiable.

@@ -21,32 +21,42 @@ import torch
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene import geometry, library, settings
 from advsearch.scene.assets import (
-    TRIPOD,
-    Doubles,
+    TRIPOD_HEIGHT,
     EnvironmentAsset,
+    Float64Array,
     Material,
     ObjectAsset,
-    doubts,
-    sized,
+    describe_size_doubts,
+    with_size,
 )
-from advsearch.scene.camera_entries import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
+from advsearch.scene.camera_entries import (
+    MAX_TABLETOP_SIZE,
+    PRESETS,
+    TABLE_HEIGHT,
+    TABLE_SIDE,
+)
 from advsearch.scene.camera_files import read_camera
-from advsearch.scene.camera_model import CameraModel, bundled
-from advsearch.scene.formation import METERED_WHITE, WHITE, arriving, metered_gain
+from advsearch.scene.camera_model import CameraModel, make_bundled_models
+from advsearch.scene.formation import (
+    CARD_DISPLAY_VALUE,
+    CARD_REFLECTANCE,
+    compute_environment_light,
+    compute_metered_gain,
+)
 from advsearch.scene.grounds import (
     Photograph,
     find_place,
+    get_photograph,
     has_lanes,
     is_against_traffic,
-    on_its_ground,
-    paved,
-    photograph_of,
-    traffic_remark,
+    is_paved,
+    make_traffic_remark,
+    with_requested_ground,
 )
-from advsearch.scene.headlamps import with_lamps
+from advsearch.scene.headlamps import add_lamps
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import (
-    MITSUBA_FILE,
+    MITSUBA_SUFFIX,
     ImportedScene,
     import_scene,
     split_node,
@@ -57,11 +67,11 @@ from advsearch.scene.parts import (
     Lamp,
     LampGlass,
     MeshPart,
-    PlacedCamera,
     PluginPart,
+    PosedCamera,
     ScenePart,
-    mesh_part,
-    plugins_in,
+    iterate_plugins,
+    make_mesh_part,
 )
 from advsearch.scene.places.environments import import_place
 from advsearch.scene.places.place_file import is_place_file
@@ -69,9 +79,9 @@ from advsearch.scene.rig import Mount, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.things import (
     ThingPart,
-    ground_height,
-    with_solids_checked,
-    with_things,
+    add_solid_remarks,
+    add_things,
+    find_ground_height,
 )
 from advsearch.trust.stored_files import reading
 
@@ -81,9 +91,9 @@ OBJECT = "object"  # the name of the mesh under test
 ENVIRONMENT = "environment"
 ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
 """Mitsuba's lights from everywhere, of which a scene can have one."""
-NO_MAP = "none"  # what the environment of a scene without a map is called
+NO_ENVIRONMENT = "none"  # what the environment of a scene without a map is called
 # what the scene's own environment is called where another may be chosen
-OWN_MAP = "own"
+SCENE_ENVIRONMENT = "own"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +113,10 @@ class SceneDescription:
     up: str | None = None  # the up axis that was given for a mesh file
     facing: str | None = None  # the axis of a mesh file that was given for its front
     size: float | None = None  # the object's longest side in metres that was given
-    # of the object's file, that was given (`advsearch.scene.assets.UNITS`)
+    # of the object's file, that was given (`advsearch.scene.assets.METRES_PER_UNIT`)
     unit: str | None = None
     # what was asked for: names of settings, and "environment"
-    given: frozenset[str] = frozenset()
+    requested: frozenset[str] = frozenset()
     # beside object, environment and ground: further meshes, lamps, haze
     parts: tuple[ScenePart, ...] = ()
     thin_lens: bool = False  # the camera has an aperture and a focus distance
@@ -114,7 +124,7 @@ class SceneDescription:
     backdrop: bool = False
     aspect: float = 1.0  # width over height of the picture
     # those with poses of their own, by name
-    cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
+    cameras: Mapping[str, PosedCamera] = field(default_factory=dict)
     # name of the one in use; `ORBIT_CAMERA` for that of the settings
     camera: str = ORBIT_CAMERA
     # name of the mounted camera that it is (`advsearch.scene.camera_entries`); "" for
@@ -150,7 +160,7 @@ class SceneDescription:
             )
         return replace(self, parts=(*self.parts, part))
 
-    def with_values(self, **given: float | None) -> SceneDescription:
+    def with_values(self, **replaced: float | None) -> SceneDescription:
         """Return the scene with some settings replaced.
 
         Dots in their names are written as two underscores.
@@ -159,13 +169,13 @@ class SceneDescription:
             self,
             values={
                 **self.values,
-                **{name.replace("__", "."): v for name, v in given.items()},
+                **{name.replace("__", "."): v for name, v in replaced.items()},
             },
         )
 
     def without_ground(self) -> SceneDescription:
         """Return the scene without a table, a road or a place."""
-        return on_its_ground(self.with_values(ground__size=0.0))
+        return with_requested_ground(self.with_values(ground__size=0.0))
 
     @staticmethod
     def load_object(spec: str | Path) -> ObjectAsset:
@@ -175,7 +185,7 @@ class SceneDescription:
         """
         return _load_object(spec, None, None)
 
-    def seen_by(self, camera: str) -> SceneDescription:
+    def with_camera(self, camera: str) -> SceneDescription:
         """Return the scene as one of its cameras sees it, or through another lens.
 
         Args:
@@ -195,7 +205,7 @@ class SceneDescription:
             return scene._with_lens(camera)
         camera_settings = sorted(
             name
-            for name in self.given
+            for name in self.requested
             if name.startswith("camera.") and name != "camera.exposure"
         )
         if camera != ORBIT_CAMERA and camera_settings:
@@ -208,8 +218,8 @@ class SceneDescription:
 
     def _with_lens(self, camera: str) -> SceneDescription:
         """Return the scene with the lens of a camera file or a bundled camera model."""
-        if not is_path(camera) and camera not in bundled():
-            known = (ORBIT_CAMERA, *self.cameras, *bundled(), *PRESETS)
+        if not is_path(camera) and camera not in make_bundled_models():
+            known = (ORBIT_CAMERA, *self.cameras, *make_bundled_models(), *PRESETS)
             raise UnknownNameError(
                 "camera",
                 camera,
@@ -217,7 +227,7 @@ class SceneDescription:
                 "Or give the path of a camera file, such as calib.yaml.",
             )
         scene = self
-        model = bundled().get(camera)
+        model = make_bundled_models().get(camera)
         if is_path(camera):
             rig = read_rig(camera)
             if rig:
@@ -229,7 +239,7 @@ class SceneDescription:
                 with reading(camera.partition("#")[0]):
                     model = read_camera(camera)
         if model is not None:
-            model.check_given(self.given)
+            model.check_no_fov(self.requested)
         return replace(scene, camera_model=model)
 
     def _with_mounted_camera(self, name: str) -> SceneDescription:
@@ -247,15 +257,15 @@ class SceneDescription:
         is_on_plane = (
             self.number("ground.size") > 0.0
             and self.photograph is None
-            and not paved(self)
+            and not is_paved(self)
         )
-        is_on_table = is_on_plane and self.object.metres <= ON_TABLES
+        is_on_table = is_on_plane and self.object.metres <= MAX_TABLETOP_SIZE
         preset_values = {"camera.fov": preset.fov}
-        if "camera.elevation" not in self.given:
+        if "camera.elevation" not in self.requested:
             place = find_place(self)
             floor = 0.0 if place is None else place.file.floor
             if is_on_table:
-                floor = -TABLE
+                floor = -TABLE_HEIGHT
             preset_values["camera.height"] = preset.height + floor
         if preset.in_lane:
             preset_values["camera.azimuth"] = 0.0
@@ -263,15 +273,15 @@ class SceneDescription:
             preset_values["ground.size"] = TABLE_SIDE / self.metres
         values = dict(self.values)
         for setting, value in preset_values.items():
-            if setting not in self.given:
+            if setting not in self.requested:
                 values[setting] = value
         scene = replace(
             self, camera=ORBIT_CAMERA, camera_model=None, preset=name, values=values
         )
-        if "camera.distance" in self.given:
+        if "camera.distance" in self.requested:
             return scene
         fov = torch.tensor(scene.number("camera.fov"), dtype=torch.float64)
-        framing = float(geometry.framing_distance(scene, fov, scene.aspect))
+        framing = float(geometry.compute_framing_distance(scene, fov, scene.aspect))
         distance = max(preset.distance, framing * scene.metres)
         return scene.with_values(camera__distance=distance)
 
@@ -292,10 +302,10 @@ class SceneDescription:
         The one under test is `OBJECT`.
         """
         around = {
-            name: geometry.moved_part(part, self.values)
-            for name, part in self.around.items()
+            name: geometry.apply_settings(part, self.values)
+            for name, part in self.surrounding_meshes.items()
         }
-        object_part = mesh_part(
+        object_part = make_mesh_part(
             OBJECT, self.object, geometry.object_to_world(self), self.material
         )
         meshes = {OBJECT: object_part, **around}
@@ -308,7 +318,7 @@ class SceneDescription:
         }
 
     @cached_property
-    def around(self) -> Mapping[str, MeshPart]:
+    def surrounding_meshes(self) -> Mapping[str, MeshPart]:
         """The meshes around the object by name, as they came."""
         return {part.name: part for part in self.parts if isinstance(part, MeshPart)}
 
@@ -318,13 +328,13 @@ class SceneDescription:
         return {part.name: part for part in self.parts if isinstance(part, ThingPart)}
 
     @property
-    def cut_out(self) -> bool:
+    def has_opacity(self) -> bool:
         return any(
             mesh.opacity is not None for mesh in self.meshes.values()
         ) or self._has_plugin("mask")
 
     @property
-    def normal_mapped(self) -> bool:
+    def has_normal_maps(self) -> bool:
         return any(
             mesh.normal_map is not None for mesh in self.meshes.values()
         ) or self._has_plugin("normalmap", "bumpmap")
@@ -338,41 +348,51 @@ class SceneDescription:
         return any(
             inner.get("type") in kinds
             for plugin in (*surfaces, *plugins)
-            for inner in plugins_in(plugin)
+            for inner in iterate_plugins(plugin)
         )
 
     @property
-    def emits(self) -> bool:
+    def has_emission(self) -> bool:
         return any(mesh.emission is not None for mesh in self.meshes.values())
 
     @property
     def lamps(self) -> Mapping[str, Lamp]:
         """Every light beside the environment, by name."""
         return {
-            part.name: self.placed(part)
+            part.name: self.get_positioned_part(part)
             for part in self.parts
             if isinstance(part, Lamp)
         }
 
-    def placed(self, part: ScenePart) -> Any:
+    def get_positioned_part(self, part: ScenePart) -> Any:
         """Return one of the parts as the settings and the camera have it."""
         if not isinstance(part, BeamLamp):
             return self.meshes.get(part.name, part)
         if part.carrier == CAMERA:
-            carrier = geometry.driving(torch.from_numpy(geometry.camera_to_world(self)))
+            carrier = geometry.compute_car_pose(
+                torch.from_numpy(geometry.camera_to_world(self))
+            )
         else:
             carrier = torch.from_numpy(self.meshes[part.carrier].to_world)
         return replace(
-            part, to_world=geometry.seated(carrier, torch.from_numpy(part.seat)).numpy()
+            part,
+            to_world=geometry.compute_seated_pose(
+                carrier, torch.from_numpy(part.seat)
+            ).numpy(),
         )
 
     @property
-    def lit(self) -> bool:
+    def is_lit(self) -> bool:
         """Whether there is anything that shines."""
         shining = any(
-            part.shines for part in self.parts if isinstance(part, PluginPart)
+            part.emits_light for part in self.parts if isinstance(part, PluginPart)
         )
-        return self.environment is not None or bool(self.lamps) or shining or self.emits
+        return (
+            self.environment is not None
+            or bool(self.lamps)
+            or shining
+            or self.has_emission
+        )
 
     @property
     def metres(self) -> float:
@@ -388,10 +408,10 @@ class SceneDescription:
     def environment_name(self) -> str:
         """How the environment was asked for, or else its own name.
 
-        `NO_MAP` where there is none.
+        `NO_ENVIRONMENT` where there is none.
         """
         return self.environment_spec or (
-            NO_MAP if self.environment is None else self.environment.name
+            NO_ENVIRONMENT if self.environment is None else self.environment.name
         )
 
     @property
@@ -399,8 +419,10 @@ class SceneDescription:
         """What a user should know of how the scene was read, and remarks of controls."""
         light_notes = () if self.environment is None else self.environment.warnings
         camera_notes = () if self.camera_model is None else self.camera_model.notes
-        size_remarks = doubts(
-            self.object, asked=self.size is not None, laid=paved(self)
+        size_remarks = describe_size_doubts(
+            self.object,
+            has_user_size=self.size is not None,
+            needs_metres=is_paved(self),
         )
         front = self.object.front
         front_remarks = (
@@ -409,7 +431,7 @@ class SceneDescription:
             else ()
         )
         traffic_remarks = (
-            (traffic_remark(self),) if self._drives_against_traffic else ()
+            (make_traffic_remark(self),) if self._drives_against_traffic else ()
         )
         notes = (
             *self.object.notes,
@@ -424,53 +446,57 @@ class SceneDescription:
 
     @property
     def _drives_against_traffic(self) -> bool:
-        return self.is_seen_from_orbit and is_against_traffic(
+        return self.uses_orbit_camera and is_against_traffic(
             self, geometry.camera_to_world(self)
         )
 
-    def environment_for(self, who: str) -> EnvironmentAsset:
+    def require_environment(self, requester: str) -> EnvironmentAsset:
         """Return the environment for what cannot do without a map.
 
         Raises InputError: the scene has none.
         """
         if self.environment is None:
-            check_one_environment(self.parts, who)
+            check_single_environment(self.parts, requester)
             raise InputError(
-                f"{who}: the scene has no environment map; give it one, "
-                f"or leave {who} out"
+                f"{requester}: the scene has no environment map; give it one, "
+                f"or leave {requester} out"
             )
         return self.environment
 
     @property
-    def is_seen_from_orbit(self) -> bool:
+    def uses_orbit_camera(self) -> bool:
         """Whether the settings `camera.*` say where its camera is, and not a file."""
         return self.camera == ORBIT_CAMERA
 
     @property
     def metered_irradiance(self) -> float:
         """Irradiance that the exposure of images is metered for, in scene units."""
-        return METERED_WHITE * math.pi / (WHITE * metered_gain(self))
+        return (
+            CARD_DISPLAY_VALUE
+            * math.pi
+            / (CARD_REFLECTANCE * compute_metered_gain(self))
+        )
 
-    def list_environment_light(self) -> tuple[Doubles, Doubles, Doubles]:
+    def list_environment_light(self) -> tuple[Float64Array, Float64Array, Float64Array]:
         """Return the light of the environment as directional lights.
 
         Returns:
             Unit directions (N, 3) to the light, solid angles (N,), and radiance
                 times these.
         """
-        return arriving(self)
+        return compute_environment_light(self)
 
-    def ground_height(self, place: Doubles) -> float:
+    def get_ground_height(self, position: Float64Array) -> float:
         """Return how high the ground lies at a place (2,), object sizes.
 
         Road, pavement, table or floor; or 0.
         """
-        return ground_height(self, place)
+        return find_ground_height(self, position)
 
     @property
-    def base_vertices(self) -> Doubles:
+    def base_vertices(self) -> Float64Array:
         """(V, 3) the object's vertices in world space, in its base pose."""
-        return geometry.standing(self.meshes[OBJECT])
+        return geometry.compute_base_vertices(self.meshes[OBJECT])
 
     def number(self, name: str) -> float:
         """Return a setting that always has a value.
@@ -478,19 +504,19 @@ class SceneDescription:
         Of the field of view, that of the camera in use.
         """
         if name == "camera.fov" and self.camera != ORBIT_CAMERA:
-            return self.cameras[self.camera].larger_fov(self.aspect)
+            return self.cameras[self.camera].compute_larger_fov(self.aspect)
         value = self.values[name]
         if value is None:
             raise KeyError(name)
         return value
 
     @property
-    def given_values(self) -> dict[str, float | str]:
+    def requested_values(self) -> dict[str, float | str]:
         """The settings that were requested, as users write them: a choice by its name."""
         requested: dict[str, float | str] = {}
-        for name in self.given & self.values.keys():
+        for name in self.requested & self.values.keys():
             value = self.values[name]
-            setting = settings.parameter_of(name)
+            setting = settings.find_parameter(name)
             if value is not None:
                 requested[name] = (
                     setting.options[int(value)]
@@ -517,20 +543,20 @@ class SceneDescription:
             shows_photograph = (
                 environment.photographed
                 and not self.backdrop
-                and self.given.isdisjoint(settings.TABLE_SETTINGS)
+                and self.requested.isdisjoint(settings.TABLE_SETTINGS)
             )
         if not shows_photograph:
             return None
         rotation = self.number("environment.rotation")
-        return photograph_of(environment, self.capture_height, rotation)
+        return get_photograph(environment, self.capture_height, rotation)
 
     @property
     def capture_height(self) -> float:
         """Height above the floor of the photograph's camera, object sizes."""
         height = self.values.get("ground.height")
         if height is None and self.object.metres is None:
-            return settings.PHOTOGRAPHED_FROM
-        return (TRIPOD if height is None else height) / self.metres
+            return settings.DEFAULT_PHOTOGRAPH_HEIGHT
+        return (TRIPOD_HEIGHT if height is None else height) / self.metres
 
     @property
     def ground_color(self) -> tuple[float, ...]:
@@ -551,7 +577,7 @@ class SceneDescription:
         stops = self.values.get("camera.ev")
         unit = None if self.environment is None else self.environment.candelas
         if stops is None:
-            exposure = metered_gain(self) if self.metered else 1.0
+            exposure = compute_metered_gain(self) if self.metered else 1.0
         elif unit is None:
             raise InputError(
                 "`set` camera.ev: the brightness of this environment has no unit; take "
@@ -563,11 +589,11 @@ class SceneDescription:
         return exposure * math.pow(2.0, self.number("camera.exposure"))
 
 
-def describe(
+def load_description(
     object_spec: str | Path | ObjectAsset,
     environment_spec: str | Path | EnvironmentAsset | None = None,
     *,
-    given: settings.Given | None = None,
+    given: settings.SettingValues | None = None,
     up: str | None = None,
     facing: str | None = None,
     size: float | None = None,
@@ -583,7 +609,7 @@ def describe(
 
     Args:
         object_spec: with `plugins` the id of a shape.
-        environment_spec: `NO_MAP` is no map at all.
+        environment_spec: `NO_ENVIRONMENT` is no map at all.
         given: settings of the scene by name.
         up: the up axis of a mesh file.
         facing: the axis of a mesh file that is its front.
@@ -593,33 +619,33 @@ def describe(
         things: what stands beside the object.
     """
     given = given or {}
-    values = settings.resolve(given)
+    values = settings.resolve_settings(given)
     file: str | Path | ObjectAsset = object_spec
     node = None
     if isinstance(object_spec, str):
         file, node = split_node(object_spec)
-    is_mitsuba_file = node is not None and str(file).lower().endswith(MITSUBA_FILE)
+    is_mitsuba_file = node is not None and str(file).lower().endswith(MITSUBA_SUFFIX)
     is_mitsuba = plugins is not None or is_mitsuba_file
     is_scene_file = node is not None or is_mitsuba
     _check_axes(up, facing, is_scene_file=is_scene_file, is_mitsuba=is_mitsuba)
     if plugins is not None:
         # a circle: it takes descriptions
-        from advsearch.scene.mitsuba_backend.scene_files import import_plugins
+        from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
 
-        imported = import_plugins(plugins, node or str(object_spec))
+        imported = import_mitsuba_scene(plugins, node or str(object_spec))
     elif node is None:
         imported = ImportedScene(_load_object(object_spec, up, facing))
     else:
         imported = _import_scene_file(Path(str(file)), node, is_mitsuba=is_mitsuba)
-    imported = replace(imported, object=sized(imported.object, size, unit))
+    imported = replace(imported, object=with_size(imported.object, size, unit))
 
     is_lit = _has_lights(imported.surroundings)
     if is_mitsuba and imported.object.emission is not None:
         is_lit = True
-    lit_by = environment_spec or (NO_MAP if is_lit else DEFAULT_ENVIRONMENT)
+    lit_by = environment_spec or (NO_ENVIRONMENT if is_lit else DEFAULT_ENVIRONMENT)
     check_ground(given, lit_by)
-    if lit_by != NO_MAP:
-        check_one_environment(
+    if lit_by != NO_ENVIRONMENT:
+        check_single_environment(
             imported.surroundings, f"`environment={_spec_text(lit_by)}`"
         )
     if is_scene_file and not {"ground.size", "ground.kind"} & set(given):
@@ -640,15 +666,15 @@ def describe(
         facing,
         size,
         unit,
-        given=frozenset(requested),
+        requested=frozenset(requested),
         parts=imported.surroundings,
         cameras=imported.cameras,
         camera=camera,
         metered=not is_mitsuba,
     )
-    described = with_things(on_its_ground(described), things, _load_thing)
-    described = with_lamps(with_solids_checked(described))
-    check_meshes(described, values)
+    described = add_things(with_requested_ground(described), things, _load_thing)
+    described = add_lamps(add_solid_remarks(described))
+    check_mesh_names(described, values)
     _check_material_settings(described.object, given)
     return described
 
@@ -677,20 +703,20 @@ def _import_scene_file(path: Path, node: str, *, is_mitsuba: bool) -> ImportedSc
         if not is_mitsuba:
             return import_scene(path, node)
         # a circle: it takes descriptions
-        from advsearch.scene.mitsuba_backend.scene_files import import_plugins
+        from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
 
-        return import_plugins(path, node)
+        return import_mitsuba_scene(path, node)
 
 
 def _has_lights(parts: Iterable[ScenePart]) -> bool:
     """Return whether one of the parts is a light."""
     return any(
-        isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines)
+        isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.emits_light)
         for part in parts
     )
 
 
-def _describes_orbit(requested: settings.Given) -> bool:
+def _describes_orbit(requested: settings.SettingValues) -> bool:
     """Return whether settings say where the camera around the object is."""
     return any(
         name.startswith("camera.") and name != "camera.exposure" for name in requested
@@ -700,10 +726,10 @@ def _describes_orbit(requested: settings.Given) -> bool:
 def _load_environment(
     lit_by: str | Path | EnvironmentAsset,
 ) -> EnvironmentAsset | None:
-    """Return an environment, bundled or from a file; None for `NO_MAP`."""
+    """Return an environment, bundled or from a file; None for `NO_ENVIRONMENT`."""
     if isinstance(lit_by, EnvironmentAsset):
         return lit_by
-    if lit_by == NO_MAP:
+    if lit_by == NO_ENVIRONMENT:
         return None
     if is_place_file(lit_by):
         return import_place(str(lit_by))
@@ -713,7 +739,9 @@ def _load_environment(
     return library.load_environment(str(lit_by))
 
 
-def _check_material_settings(asset: ObjectAsset, requested: settings.Given) -> None:
+def _check_material_settings(
+    asset: ObjectAsset, requested: settings.SettingValues
+) -> None:
     """Check that settings of the material apply. Raises InputError: they do not."""
     material_settings = [name for name in requested if name.startswith("material.")]
     if asset.surface is not None and material_settings:
@@ -726,55 +754,57 @@ def _check_material_settings(asset: ObjectAsset, requested: settings.Given) -> N
         )
 
 
-def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
+def check_mesh_names(scene: SceneDescription, names: Iterable[str]) -> None:
     """Check that a scene has the meshes whose settings are named.
 
     Raises UnknownNameError: it has not.
     """
     for name in names:
-        mesh = settings.mesh_of(name)
-        if mesh is not None and mesh not in scene.around:
+        mesh = settings.parse_mesh_name(name)
+        if mesh is not None and mesh not in scene.surrounding_meshes:
             raise UnknownNameError(
                 "mesh around the object",
                 mesh,
-                scene.around,
+                scene.surrounding_meshes,
                 f"It stands in `set` {name}.",
             )
 
 
-def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:
+def check_single_environment(parts: Iterable[ScenePart], requester: str) -> None:
     """Check that a Mitsuba scene has no environment of its own among its parts.
 
     Raises InputError: it has, and another is requested.
 
     Args:
         parts: of the scene.
-        who: the setting that needs a map of ours, as users write it.
+        requester: the setting that needs a map of ours, as users write it.
     """
     for part in parts:
         if isinstance(part, PluginPart) and part.plugin.get("type") in ENVIRONMENTS:
             raise InputError(
-                f"{who}: the Mitsuba scene has an environment of its own, {part.name} "
+                f"{requester}: the Mitsuba scene has an environment of its own, {part.name} "
                 f"(a {part.plugin['type']}), and "
-                f"there can be one only; leave {who} out, or take {part.name} out of "
+                f"there can be one only; leave {requester} out, or take {part.name} out of "
                 "the scene"
             )
 
 
-def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -> None:
+def check_ground(
+    requested: settings.SettingValues, lit_by: str | Path | EnvironmentAsset
+) -> None:
     """Check the settings of a ground that is no table.
 
     Raises InputError: there is no photograph to show, or a table is described as well.
     """
-    kind = given.get("ground.kind")
-    if kind not in (settings.PHOTOGRAPH, *settings.ROADS, *settings.PLACES):
+    kind = requested.get("ground.kind")
+    if kind not in (settings.PHOTOGRAPH, *settings.ROAD_KINDS, *settings.PLACE_KINDS):
         return
-    if lit_by == NO_MAP and kind == settings.PHOTOGRAPH:
+    if lit_by == NO_ENVIRONMENT and kind == settings.PHOTOGRAPH:
         raise InputError(
             "`set` ground.kind=photograph: the scene has no environment map to show; "
             "give it one, or leave it out"
         )
-    described = [name for name in settings.TABLE_SETTINGS if name in given]
+    described = [name for name in settings.TABLE_SETTINGS if name in requested]
     if described:
         raise InputError(
             f"`set` ground.kind={kind} and `set` {described[0]} contradict each other: "

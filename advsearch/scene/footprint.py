@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from advsearch.scene.assets import Doubles
+from advsearch.scene.assets import Float64Array
 
 
 class Footprint(NamedTuple):
     """A convex outline on the ground, corners (K, 2), and a range of heights."""
 
-    outline: Doubles
-    low: float
-    high: float
+    outline: Float64Array
+    lower: float
+    upper: float
 
 
 class Solid(NamedTuple):

@@ -20,20 +20,26 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Ints, face_vectors
-from advsearch.scene.color import LOW_END, linear_to_srgb, srgb_to_linear
+from advsearch.scene.assets import (
+    EnvironmentAsset,
+    Float32Array,
+    Float64Array,
+    IntArray,
+    compute_area_vectors,
+)
+from advsearch.scene.color import LINEAR_LIMIT, linear_to_srgb, srgb_to_linear
 from advsearch.scene.geometry import (
-    NEAREST,
+    MIN_DEPTH,
     Frame,
     camera_to_world,
+    compute_base_vertices,
+    make_rotation,
     object_to_world,
-    rotation,
-    standing,
 )
-from advsearch.scene.grounds import paved
+from advsearch.scene.grounds import is_paved
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import looked_up, pixels_in
-from advsearch.scene.settings import ORBIT_CAMERA, resolve
+from advsearch.scene.raster import look_up_texture, rasterize_triangles
+from advsearch.scene.settings import ORBIT_CAMERA, resolve_settings
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -49,7 +55,7 @@ PRIMES = (
 )
 # keeps the slope of a power finite in black; it changes a value by at most half of one
 # of 255 levels
-DARK = 1e-6
+MIN_GAMMA_VALUE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -100,7 +106,7 @@ class ImageFormation:
         if self.transfer == "linear":
             return radiance * self.gain
         if self.transfer == "gamma":
-            return (radiance * self.gain).clamp(DARK, 1.0) ** (1.0 / 2.2)
+            return (radiance * self.gain).clamp(MIN_GAMMA_VALUE, 1.0) ** (1.0 / 2.2)
         if self.transfer == "reinhard":
             light = (radiance * self.gain).clamp_min(0.0)
             return linear_to_srgb(light / (1.0 + light))
@@ -120,8 +126,8 @@ class _SrgbDisplay(torch.autograd.Function):
         ctx.save_for_backward(radiance)
         ctx.gain = gain
         clipped = (radiance * gain).clamp_(0.0, 1.0)
-        is_low = clipped <= LOW_END
-        curve = clipped.clamp(min=LOW_END).pow_(1.0 / 2.4).mul_(1.055).sub_(0.055)
+        is_low = clipped <= LINEAR_LIMIT
+        curve = clipped.clamp(min=LINEAR_LIMIT).pow_(1.0 / 2.4).mul_(1.055).sub_(0.055)
         return torch.where(is_low, clipped.mul_(12.92), curve)
 
     @staticmethod
@@ -135,14 +141,14 @@ class _SrgbDisplay(torch.autograd.Function):
             return gradient, None
         linear = radiance * ctx.gain
         is_inside = (linear >= 0.0) & (linear <= 1.0)
-        slope = linear.clamp(LOW_END, 1.0).pow_(1.0 / 2.4 - 1.0).mul_(1.0 / 2.4)
+        slope = linear.clamp(LINEAR_LIMIT, 1.0).pow_(1.0 / 2.4 - 1.0).mul_(1.0 / 2.4)
         slope = slope.mul_(cotangent * 1.055)
-        slope = torch.where(linear <= LOW_END, cotangent * 12.92, slope)
+        slope = torch.where(linear <= LINEAR_LIMIT, cotangent * 12.92, slope)
         return torch.where(is_inside, slope, 0.0).mul_(ctx.gain), None
 
 
 @lru_cache(maxsize=64)
-def next_count(sampler: str, samples: float) -> int:
+def round_sample_count(sampler: str, samples: float) -> int:
     """Return the number of samples that a sampler takes when it needs at least some.
 
     Independent samples come in any number; stratified ones in squares, multi-jittered
@@ -163,7 +169,7 @@ def next_count(sampler: str, samples: float) -> int:
     return count
 
 
-ITEMS: Mapping[str, str] = {
+OMISSIONS: Mapping[str, str] = {
     "tracing": "tracing a render anew: it is recorded once and replayed",
     "uploads": "writing inputs that are as they were, with the sampling tables and the "
     "ray tracing tree that follow",
@@ -183,9 +189,9 @@ Bounces of light are another matter
 within a measured bound, and the verification renders all of them.
 """
 
-EVERYTHING = frozenset(ITEMS)  # leave out all that can be
+ALL_OMISSIONS = frozenset(OMISSIONS)  # leave out all that can be
 # leave out nothing: what a program has to do that knows neither scene nor search
-NOTHING: frozenset[str] = frozenset()
+NO_OMISSIONS: frozenset[str] = frozenset()
 
 
 # ----------------------------------------------------------------------------------
@@ -206,29 +212,34 @@ NOTHING: frozenset[str] = frozenset()
 # E(up) where w ends on the ground
 
 # pixels along the longer side of the image in which the surface is sampled
-RASTER = 32
-ROWS = 32  # rows of a coarse environment: irradiance varies slowly
-WHITE = 0.8  # reflectance of the card that is metered
+METERING_SIZE = 32
+METERING_ROWS = 32  # rows of a coarse environment: irradiance varies slowly
+CARD_REFLECTANCE = 0.8  # reflectance of the card that is metered
 # linear display value that it gets, on average over what the camera sees of the object
-METERED_WHITE = 0.5
-_NINTHS = [(a, b) for a in range(4) for b in range(4 - a)]
-WITHIN = (
-    np.array([(3 * a + 1, 3 * b + 1, 10 - 3 * a - 3 * b) for a, b in _NINTHS]) / 12.0
+CARD_DISPLAY_VALUE = 0.5
+_BARYCENTRIC_STEPS = [(a, b) for a in range(4) for b in range(4 - a)]
+FACE_SAMPLE_WEIGHTS = (
+    np.array(
+        [(3 * a + 1, 3 * b + 1, 10 - 3 * a - 3 * b) for a, b in _BARYCENTRIC_STEPS]
+    )
+    / 12.0
 )
 """Barycentric weights (10, 3) of the points of a face at which its radiance is read."""
-MOVED = ("camera.", "pose.", "environment.")
+METERED_DEFAULTS = ("camera.", "pose.", "environment.")
 """Beginnings of names of settings whose defaults are metered: controls move these."""
 
 
 @lru_cache(maxsize=8)
-def metered_gain(scene: SceneDescription) -> float:
-    """Return the factor on radiance that gives the metered white card `METERED_WHITE`.
+def compute_metered_gain(scene: SceneDescription) -> float:
+    """Return the factor on radiance that gives the metered white card `CARD_DISPLAY_VALUE`.
 
     Where the camera sees nothing of the object, the card lies on the ground; where no
     light arrives the factor is 1.
     """
     default = {
-        name: value for name, value in resolve({}).items() if name.startswith(MOVED)
+        name: value
+        for name, value in resolve_settings({}).items()
+        if name.startswith(METERED_DEFAULTS)
     }
     scene = replace(
         scene,
@@ -237,50 +248,56 @@ def metered_gain(scene: SceneDescription) -> float:
         camera=ORBIT_CAMERA,
         camera_model=None,
     )
-    normals = visible_normals(scene)
+    normals = compute_visible_normals(scene)
     if not len(normals):
         normals = np.array([[0.0, 0.0, 1.0]])
-    metered = float(irradiance(scene, normals).mean())
-    return METERED_WHITE * math.pi / (WHITE * metered) if metered > 0.0 else 1.0
+    metered = float(compute_irradiance(scene, normals).mean())
+    return (
+        CARD_DISPLAY_VALUE * math.pi / (CARD_REFLECTANCE * metered)
+        if metered > 0.0
+        else 1.0
+    )
 
 
-def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
+def compute_irradiance(scene: SceneDescription, normals: Float64Array) -> Float64Array:
     """Return the irradiance (N, 3) on unshadowed surfaces at the object's center.
 
     The surfaces have unit normals (N, 3).
     """
     vertices = scene.base_vertices
     center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    directions, power = _environment_and_ground(scene, center)
+    directions, power = _compute_distant_light(scene, center)
     cosines = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
     # no BLAS, whose last bits depend on its threads
     irradiances = np.asarray(np.einsum("nw,wc->nc", cosines, power))
     for lamp in scene.lamps.values():
-        direction, lamp_irradiance = lamp.lighting(center)
+        direction, lamp_irradiance = lamp.compute_lighting(center)
         if lamp_irradiance.any():  # the lamps of controls are dark by default
             distance = max(float(np.linalg.norm(direction)), 1e-12)
             cosine = np.maximum(normals @ (direction / distance), 0.0)
             irradiances = irradiances + cosine[:, None] * lamp_irradiance
     # what the object emits belongs to what it is made of
-    for name in scene.around:
+    for name in scene.surrounding_meshes:
         part = scene.meshes[name]
         if part.emission is not None:
-            face_directions, face_power = _emitted(part, part.emission, center)
+            face_directions, face_power = _compute_emitted_light(
+                part, part.emission, center
+            )
             cosines = np.maximum(np.einsum("nk,fk->nf", normals, face_directions), 0.0)
             emitted = np.einsum("nf,fc->nc", cosines, face_power)
             irradiances = irradiances + emitted
     return irradiances
 
 
-def _environment_and_ground(
-    scene: SceneDescription, center: Doubles
-) -> tuple[Doubles, Doubles]:
+def _compute_distant_light(
+    scene: SceneDescription, center: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return directions (N, 3) to the light of environment and ground.
 
     The second value (N, 3) is its radiance times the solid angle. Directions that hit
     the ground have the light that it reflects.
     """
-    directions, solid_angle, power = arriving(scene)
+    directions, solid_angle, power = compute_environment_light(scene)
     is_up = directions[:, 2] > 0.0
     on_ground = (power[is_up] * directions[is_up, 2:]).sum(axis=0)
     albedo = srgb_to_linear(np.array(scene.ground_color, np.float32))
@@ -288,27 +305,29 @@ def _environment_and_ground(
     distance = center[2] / np.maximum(-directions[:, 2:], 1e-9)
     offset = np.abs(center[:2] + directions[:, :2] * distance)
     # otherwise the map has what comes from below
-    has_plain_ground = scene.photograph is None and not paved(scene)
+    has_plain_ground = scene.photograph is None and not is_paved(scene)
     in_reach = (offset <= scene.number("ground.size") / 2.0).all(axis=1)
     hits = has_plain_ground & ~is_up & in_reach
     power = np.where(hits[:, None], reflected * solid_angle[:, None], power)
     return directions, power
 
 
-def arriving(scene: SceneDescription) -> tuple[Doubles, Doubles, Doubles]:
+def compute_environment_light(
+    scene: SceneDescription,
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the environment's light in a coarse map.
 
     Returns:
         Unit directions (N, 3), solid angles (N,), and radiance times these (N, 3).
     """
-    directions, solid_angle, power = _arriving(scene.environment)
-    turn = rotation(scene.number("environment.rotation"), 0.0, 0.0)
+    directions, solid_angle, power = _compute_unrotated_light(scene.environment)
+    turn = make_rotation(scene.number("environment.rotation"), 0.0, 0.0)
     return directions @ turn.T, solid_angle, power
 
 
-def _emitted(
-    part: MeshPart, emission: Floats, place: Doubles
-) -> tuple[Doubles, Doubles]:
+def _compute_emitted_light(
+    part: MeshPart, emission: Float32Array, point: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return the light that arrives at a point (3,) from the faces of a mesh.
 
     A face is taken for a disk of its mean radiance.
@@ -317,22 +336,22 @@ def _emitted(
         Unit directions (F, 3) to the faces, and the irradiance (F, 3) of a surface that
         faces each.
     """
-    corners = standing(part)[part.mesh.faces]
-    area = face_vectors(corners) / 2.0
-    offset = corners.mean(axis=1) - place
+    corners = compute_base_vertices(part)[part.mesh.faces]
+    area = compute_area_vectors(corners) / 2.0
+    offset = corners.mean(axis=1) - point
     squared_distance = (offset * offset).sum(axis=1)
     direction = offset / np.maximum(np.sqrt(squared_distance), 1e-12)[:, None]
-    uv = np.einsum("pk,fkc->fpc", WITHIN, part.mesh.uvs[part.mesh.faces])
+    uv = np.einsum("pk,fkc->fpc", FACE_SAMPLE_WEIGHTS, part.mesh.uvs[part.mesh.faces])
     height, width = emission.shape[:2]
     column = uv[..., 0] * width - 0.5
     row = (1.0 - uv[..., 1]) * height - 0.5
-    mean = looked_up(emission, column, row).mean(axis=1)
+    mean = look_up_texture(emission, column, row).mean(axis=1)
     projected_area = np.maximum(-(area * direction).sum(axis=1), 0.0)
     disk = squared_distance + np.linalg.norm(area, axis=1) / math.pi
     return direction, mean * (projected_area / disk)[:, None]
 
 
-def visible_normals(scene: SceneDescription) -> Doubles:
+def compute_visible_normals(scene: SceneDescription) -> Float64Array:
     """Return the unit normals (N, 3) of the object in the pixels of a small image.
 
     They point towards the camera.
@@ -340,14 +359,14 @@ def visible_normals(scene: SceneDescription) -> Doubles:
     camera = camera_to_world(scene)
     points = (scene.base_vertices - camera[:3, 3]) @ camera[:3, :3]
     faces = scene.object.mesh.faces.astype(np.int64)
-    faces = faces[(points[faces][..., 2] > NEAREST).all(axis=1)]
+    faces = faces[(points[faces][..., 2] > MIN_DEPTH).all(axis=1)]
     frame = Frame.of(scene.number("camera.fov"), scene.aspect)
     width = frame.right - frame.left
     height = frame.high - frame.low
-    pixel = max(width, height) / RASTER
+    pixel = max(width, height) / METERING_SIZE
     shape = (round(height / pixel), round(width / pixel))
     tangents = points[faces][..., :2] / points[faces][..., 2:]
-    face, row, column, weights = pixels_in(
+    face, row, column, weights = rasterize_triangles(
         (tangents - (frame.left, frame.low)) / pixel - 0.5, shape
     )
     # 1 / depth is linear in the image
@@ -368,13 +387,15 @@ def visible_normals(scene: SceneDescription) -> Doubles:
 
 
 @lru_cache(maxsize=8)
-def _arriving(environment: EnvironmentAsset | None) -> tuple[Doubles, Doubles, Doubles]:
-    """Return an environment's light as `arriving` does, without its rotation; z up."""
+def _compute_unrotated_light(
+    environment: EnvironmentAsset | None,
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Return an environment's light as `compute_environment_light` does, without its rotation; z up."""
     if environment is None:
         return np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
     height, width = environment.radiance.shape[:2]
-    rows = _block_starts(height, ROWS)
-    columns = _block_starts(width, 2 * ROWS)
+    rows = _find_block_starts(height, METERING_ROWS)
+    columns = _find_block_starts(width, 2 * METERING_ROWS)
     # rows 0 and -1 are the poles
     polar = np.clip((np.arange(height + 1) - 0.5) / (height - 1), 0.0, 1.0) * math.pi
     solid_angle = -np.diff(np.cos(polar)) * (2.0 * math.pi / width)
@@ -395,7 +416,7 @@ def _arriving(environment: EnvironmentAsset | None) -> tuple[Doubles, Doubles, D
     return directions.reshape(-1, 3), sums[:, 3], sums[:, :3]
 
 
-def _block_starts(size: int, count: int) -> Ints:
+def _find_block_starts(size: int, count: int) -> IntArray:
     """Return where `count` blocks of rows or columns begin, or fewer of one each."""
     bounds = np.linspace(0, size, min(count, size) + 1).astype(np.int64)
     return np.unique(bounds[:-1])
@@ -412,13 +433,13 @@ def _block_starts(size: int, count: int) -> Ints:
 # and the tone curve. The mean is over M moments, evenly spaced, of which each row takes
 # those in its own exposure.
 
-FEWEST = 8
-MOST = 64
+MIN_MOMENTS = 8
+MAX_MOMENTS = 64
 # moments for each pixel that the fastest point of the image moves during the exposure
-A_PIXEL = 2
+MOMENTS_PER_PIXEL = 2
 
 
-class Later(Protocol):
+class InputMapping(Protocol):
     """Maps a configuration to scene inputs, as `InputSpace` does, at another time."""
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
@@ -429,12 +450,14 @@ class Later(Protocol):
 class Moment:
     """A part of an exposure."""
 
-    space: Later  # maps configurations to scene inputs at that time
-    rows: Tensor  # (H,) its fraction of each row, which adds up to 1 over all moments
-    samples: float  # its fraction of the samples per pixel
+    space: InputMapping  # maps configurations to scene inputs at that time
+    row_fractions: (
+        Tensor  # (H,) its fraction of each row, which adds up to 1 over all moments
+    )
+    sample_fraction: float  # its fraction of the samples per pixel
 
 
-def moments_of(
+def divide_exposure(
     shutter: float, rolling: float, height: int, count: int
 ) -> tuple[Tensor, Tensor, float]:
     """Divide an exposure into moments.
@@ -495,7 +518,7 @@ CHANNELS: Mapping[str, str] = {
 """The channels of each layer, by EXR's names."""
 
 
-def aovs_of(text: str | None) -> tuple[str, ...]:
+def parse_aovs(text: str | None) -> tuple[str, ...]:
     """Return the names in a list separated by commas, each once.
 
     Raises:
@@ -525,11 +548,11 @@ class Surfaces:
     uv: Tensor  # (H, W, 2) texture coordinates; v = 0 is the bottom row
     face: Tensor  # (H, W) int64 index of the triangle in its mesh
 
-    def seen(self, name: str) -> Tensor:
+    def visible_mask(self, name: str) -> Tensor:
         """Return where a shape is visible, (H, W) bool."""
         return self.id == self.names.index(name) + 1
 
-    def layers(self, aovs: Sequence[str], mask: str) -> dict[str, Tensor]:
+    def make_layers(self, aovs: Sequence[str], mask: str) -> dict[str, Tensor]:
         """Return the channels (H, W) of layers, such as ``normal.X``.
 
         Args:
@@ -538,13 +561,17 @@ class Surfaces:
         """
         channels: dict[str, Tensor] = {}
         for name in aovs:
-            value = self.seen(mask).float() if name == "mask" else getattr(self, name)
+            value = (
+                self.visible_mask(mask).float()
+                if name == "mask"
+                else getattr(self, name)
+            )
             planes = value[..., None] if value.ndim == 2 else value
             for index, channel in enumerate(CHANNELS[name]):
                 channels[f"{name}.{channel}"] = planes[..., index]
         return channels
 
-    def notes(self, aovs: Sequence[str]) -> dict[str, str]:
+    def describe_layers(self, aovs: Sequence[str]) -> dict[str, str]:
         """Return what the values of the layers mean, by name."""
         notes = {name: AOVS[name] for name in aovs}
         if "id" in notes:

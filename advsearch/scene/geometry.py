@@ -30,14 +30,14 @@ import torch
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from advsearch.scene.assets import Doubles, pose_of
+from advsearch.scene.assets import Float64Array, make_pose
 from advsearch.scene.camera_model import CameraModel as CameraModel
 from advsearch.scene.parts import Footprint, MeshPart
-from advsearch.scene.rigged import PERSON as PERSON
+from advsearch.scene.rigged import PERSON_PARAMETERS as PERSON_PARAMETERS
 from advsearch.scene.rigged import TIME as TIME
-from advsearch.scene.rigged import part_of_a_rig as part_of_a_rig
+from advsearch.scene.rigged import find_rig_parameter as find_rig_parameter
 from advsearch.scene.settings import ORBIT_CAMERA, POSE, SETTINGS
-from advsearch.scene.skeleton import entries_of_turn as entries_of_turn
+from advsearch.scene.skeleton import rotation_entries as rotation_entries
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -45,10 +45,12 @@ if TYPE_CHECKING:
 # share of the picture's half-width that the object may reach when the distance is
 # worked out
 FRAME_FILL = 0.86
-CLEARANCE = 0.02  # smallest distance, in object sizes, to the sphere around the object
+MIN_SPHERE_DISTANCE = (
+    0.02  # smallest distance, in object sizes, to the sphere around the object
+)
 # sine of the largest elevation, for a height that would need a steeper one
-STEEPEST = math.sin(math.radians(89.0))
-NEAREST = 1e-3  # depth up to which points have no place in the picture
+MAX_ELEVATION_SINE = math.sin(math.radians(89.0))
+MIN_DEPTH = 1e-3  # depth up to which points have no place in the picture
 DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
 
 
@@ -80,7 +82,7 @@ class Frame:
         down = 2.0 * y * shift[1]
         return Frame(-x + right, x + right, -y - down, y - down)
 
-    def corners(self) -> Doubles:
+    def corners(self) -> Float64Array:
         """Return unit directions (4, 3) to the corners."""
         tangents = [
             (x, y, 1.0) for x in (self.left, self.right) for y in (self.low, self.high)
@@ -89,7 +91,7 @@ class Frame:
         return np.asarray(corners / np.linalg.norm(corners, axis=-1, keepdims=True))
 
 
-def framing_distance(
+def compute_framing_distance(
     description: SceneDescription, fov: Tensor, aspect: float
 ) -> Tensor:
     """Return the distance () of the camera to the middle of a scene's object.
@@ -102,11 +104,14 @@ def framing_distance(
         aspect: width over height.
     """
     offsets = torch.from_numpy(
-        description.object.mesh.vertices.astype(np.float64) - middle(description)
+        description.object.mesh.vertices.astype(np.float64)
+        - compute_center(description)
     ).to(fov.device)
     model = description.camera_model
     if model is not None and model.name:  # of what it shows, a rectangle
-        edge = torch.tensor(model.tangents, dtype=torch.float64, device=fov.device)
+        edge = torch.tensor(
+            model.visible_tangents, dtype=torch.float64, device=fov.device
+        )
     else:
         shape = torch.tensor(
             [min(1.0, aspect), min(1.0, 1.0 / aspect)],
@@ -117,7 +122,7 @@ def framing_distance(
     azimuth, elevation, roll = (
         float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW
     )
-    axes = torch.from_numpy(camera_axes(azimuth, elevation, roll)).T.to(offsets)
+    axes = torch.from_numpy(compute_camera_axes(azimuth, elevation, roll)).T.to(offsets)
     (left, up, outwards) = offsets.matmul(axes).unbind(dim=1)
     (half_width, half_height) = edge * FRAME_FILL
     from_default_view = (
@@ -125,11 +130,11 @@ def framing_distance(
     ).max()
     from_all_around = _framing_distance_all_around(offsets, elevation, edge)
     return torch.maximum(from_default_view, from_all_around).clamp_min(
-        float(offsets.norm(dim=1).max()) + CLEARANCE
+        float(offsets.norm(dim=1).max()) + MIN_SPHERE_DISTANCE
     )
 
 
-def camera_axes(azimuth: float, elevation: float, roll: float) -> Doubles:
+def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float64Array:
     """Return the axes of a camera on an orbit: rows left, up and from the object to it.
 
     Args:
@@ -152,7 +157,7 @@ def camera_axes(azimuth: float, elevation: float, roll: float) -> Doubles:
     return np.stack([*turned, outwards])
 
 
-def middle(description: SceneDescription) -> Doubles:
+def compute_center(description: SceneDescription) -> Float64Array:
     """Return what the camera looks at.
 
     The middle (3,) of the object's bounding box in its default pose.
@@ -186,7 +191,7 @@ def _framing_distance_all_around(
     return torch.stack([aside.max(), above.max(), below.max()]).max()
 
 
-def rotation(yaw: float, pitch: float, roll: float) -> Doubles:
+def make_rotation(yaw: float, pitch: float, roll: float) -> Float64Array:
     """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix."""
     (cz, sz), (cy, sy), (cx, sx) = (
         (math.cos(math.radians(a)), math.sin(math.radians(a)))
@@ -198,16 +203,16 @@ def rotation(yaw: float, pitch: float, roll: float) -> Doubles:
     return np.asarray(rz @ ry @ rx)
 
 
-def affine(linear: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
+def make_affine(linear: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
     """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place (3,).
 
     Differentiable.
     """
-    top = torch.cat([linear, place[:, None]], dim=1)
+    top = torch.cat([linear, translation[:, None]], dim=1)
     return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]]).to(linear)])
 
 
-def object_to_world(description: SceneDescription) -> Doubles:
+def object_to_world(description: SceneDescription) -> Float64Array:
     """Return the object's pose.
 
     Scale and rotate about the middle of its bounding box, keep it on the ground, shift.
@@ -222,7 +227,7 @@ def object_to_world(description: SceneDescription) -> Doubles:
     return _compute_pose(vertices, 0.0, pose)
 
 
-def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
+def apply_settings(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
     """Return a mesh around the object as the settings have it.
 
     It is posed about its own middle, where it stands, by the settings `pose:NAME.yaw`
@@ -234,7 +239,7 @@ def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
         if (value := values.get(f"pose:{part.name}.{parameter.name}")) is not None
     }
     if pose:
-        positions = standing(part)
+        positions = compute_base_vertices(part)
         pose = {
             **{parameter.name: float(parameter.default) for parameter in POSE},
             **pose,
@@ -249,7 +254,7 @@ def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
     )
 
 
-def standing(part: MeshPart) -> Doubles:
+def compute_base_vertices(part: MeshPart) -> Float64Array:
     """Return where the vertices (V, 3) of a mesh are in its base pose."""
     return np.asarray(
         part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T
@@ -258,26 +263,26 @@ def standing(part: MeshPart) -> Doubles:
 
 
 def _compute_pose(
-    positions: Doubles, floor: float, pose: Mapping[str, float]
-) -> Doubles:
+    positions: Float64Array, floor: float, pose: Mapping[str, float]
+) -> Float64Array:
     """Return the pose (4, 4) by parameters of `settings.POSE`.
 
     Scale and rotate positions (V, 3) about the middle of their bounding box, put the
     lowest at `floor`, and shift.
     """
     middle = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
-    linear = pose["scale"] * rotation(pose["yaw"], pose["pitch"], pose["roll"])
+    linear = pose["scale"] * make_rotation(pose["yaw"], pose["pitch"], pose["roll"])
     lowest = float(((positions - middle) @ linear.T)[:, 2].min())
     translation = (
         np.array([pose["x"], pose["y"], floor + pose["z"] - lowest]) - linear @ middle
     )
     translation[:2] += middle[:2]
-    return pose_of(linear, translation)
+    return make_pose(linear, translation)
 
 
 def camera_to_world(
     description: SceneDescription, aspect: float | None = None
-) -> Doubles:
+) -> Float64Array:
     """Return the pose (4, 4) of the camera in use.
 
     By default it is on an orbit around the middle of the object, looking at it. The
@@ -297,7 +302,7 @@ def camera_to_world(
         distance = requested_distance / description.metres
     else:
         distance = float(
-            framing_distance(
+            compute_framing_distance(
                 description,
                 torch.tensor(get_number("camera.fov"), dtype=torch.float64),
                 aspect,
@@ -307,20 +312,22 @@ def camera_to_world(
     height = description.values.get("camera.height")
     if height is not None:
         height_above_center = (
-            height / description.metres - float(middle(description)[2])
+            height / description.metres - float(compute_center(description)[2])
         ) / distance
         elevation = math.degrees(
-            math.asin(min(max(height_above_center, -STEEPEST), STEEPEST))
+            math.asin(
+                min(max(height_above_center, -MAX_ELEVATION_SINE), MAX_ELEVATION_SINE)
+            )
         )
     azimuth = description.azimuth_zero + get_number("camera.azimuth")
-    axes = camera_axes(azimuth, elevation, get_number("camera.roll"))
-    return pose_of(
+    axes = compute_camera_axes(azimuth, elevation, get_number("camera.roll"))
+    return make_pose(
         np.stack([axes[0], axes[1], -axes[2]], axis=1),
-        middle(description) + distance * axes[2],
+        compute_center(description) + distance * axes[2],
     )
 
 
-def projected(
+def project_points(
     description: SceneDescription,
     inputs: Mapping[str, Tensor],
     points: Tensor,
@@ -356,26 +363,26 @@ def projected(
     )
     focal = max(size) / 2.0 / torch.tan(torch.deg2rad(fov) / 2.0)
     depth = points[:, 2]
-    positions = focal * points[:, :2] / depth.clamp_min(NEAREST)[:, None]
+    positions = focal * points[:, :2] / depth.clamp_min(MIN_DEPTH)[:, None]
     for axis, name in enumerate(("camera.shift_x", "camera.shift_y")):
         if name in inputs:
             positions[:, axis] -= image_size[axis] * inputs[name].double().reshape(())
-    return positions, depth > NEAREST
+    return positions, depth > MIN_DEPTH
 
 
-def seated(carrier: Tensor, seat: Tensor) -> Tensor:
+def compute_seated_pose(carrier: Tensor, seat: Tensor) -> Tensor:
     """Return the rigid pose (4, 4) of what sits at a seat (4, 4) on a carrier (4, 4).
 
     The carrier may be scaled.
     """
     scale = torch.linalg.det(carrier[:3, :3]).abs() ** (1.0 / 3.0)
-    return affine(
+    return make_affine(
         carrier[:3, :3] / scale @ seat[:3, :3],
         carrier[:3, :3] @ seat[:3, 3] + carrier[:3, 3],
     )
 
 
-def driving(camera: Tensor) -> Tensor:
+def compute_car_pose(camera: Tensor) -> Tensor:
     """Return the pose (4, 4) of a car that a camera (4, 4) looks ahead from.
 
     It is level, with its +x ahead, on the ground below the camera; differentiable.
@@ -386,11 +393,11 @@ def driving(camera: Tensor) -> Tensor:
     axes = torch.stack(
         [ahead[0], -ahead[1], zero, ahead[1], ahead[0], zero, zero, zero, one]
     ).reshape(3, 3)
-    return affine(axes, torch.cat([camera[:2, 3], zero[None]]))
+    return make_affine(axes, torch.cat([camera[:2, 3], zero[None]]))
 
 
 @lru_cache(maxsize=4)
-def real_harmonics(height: int, width: int) -> Tensor:
+def compute_real_harmonics(height: int, width: int) -> Tensor:
     """Return the nine real spherical harmonics of degrees 0 to 2: (height, width, 9).
 
     Over a map of equal angles. Each has root mean square 1 over the sphere (Ramamoorthi
@@ -414,7 +421,7 @@ def real_harmonics(height: int, width: int) -> Tensor:
     return torch.stack([*first, *second, root15 / 2.0 * (x * x - y * y)], dim=-1)
 
 
-def euler(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
+def make_euler_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix.
 
     Differentiable.
@@ -430,7 +437,7 @@ def euler(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     return about_z @ about_y @ about_x
 
 
-def rotation_vector(degrees: Tensor) -> Tensor:
+def make_vector_rotation(degrees: Tensor) -> Tensor:
     """Return the rotation (3, 3) about a vector (3,) by its length in degrees.
 
     Rodrigues' formula with guarded series, so that value and derivative are right at
@@ -450,8 +457,8 @@ def rotation_vector(degrees: Tensor) -> Tensor:
     return torch.eye(3).to(degrees) + sine * cross + cosine * (cross @ cross)
 
 
-PARKED = 1e-3  # size of an occluder that is put away, behind the camera
-SURROUNDINGS = (
+HIDDEN_SCALE = 1e-3  # size of an occluder that is put away, behind the camera
+OCCLUDER_INPUTS = (
     "camera.to_world",
     "camera.fov",
     "camera.shift",
@@ -462,20 +469,22 @@ SURROUNDINGS = (
 """Inputs of other controls that an occluder goes by."""
 
 
-def camera_in(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> Tensor:
+def get_camera_pose(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> Tensor:
     """Return the pose (4, 4) of the camera where the controls before have it."""
     return so_far.get("camera.to_world", torch.from_numpy(camera_to_world(scene)))
 
 
-def put_away(camera: Tensor) -> Tensor:
+def make_hidden_pose(camera: Tensor) -> Tensor:
     """Return the pose (4, 4) of what is out of sight.
 
     Tiny, behind the camera of a pose (4, 4).
     """
-    return affine(PARKED * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])
+    return make_affine(
+        HIDDEN_SCALE * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2]
+    )
 
 
-def footprint(points: Doubles) -> Footprint:
+def compute_footprint(points: Float64Array) -> Footprint:
     """Return what a cloud of points (N, 3) takes up."""
     corners = ConvexHull(points[:, :2], qhull_options="QJ").vertices
     return Footprint(
@@ -483,38 +492,40 @@ def footprint(points: Doubles) -> Footprint:
     )
 
 
-def overlapping(one: Footprint, other: Footprint) -> bool:
+def is_overlapping(first: Footprint, second: Footprint) -> bool:
     """Return whether two outlines overlap, at heights that both have."""
-    begin, end = blocked(one, other, np.array([1.0, 0.0]))
+    begin, end = find_overlap_interval(first, second, np.array([1.0, 0.0]))
     return begin < 0.0 < end
 
 
-def blocked(one: Footprint, other: Footprint, way: Doubles) -> tuple[float, float]:
+def find_overlap_interval(
+    first: Footprint, second: Footprint, direction: Float64Array
+) -> tuple[float, float]:
     """Return over which interval of a shift one footprint overlaps another.
 
     By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1),
     each of which bounds an interval.
 
     Args:
-        one: the footprint that is shifted.
-        other: the footprint that stays.
-        way: (2,) of the shift; the interval is in its length.
+        first: the footprint that is shifted.
+        second: the footprint that stays.
+        direction: (2,) of the shift; the interval is in its length.
 
     Returns:
         Begin and end; (inf, -inf) where they never overlap.
     """
-    if min(one.high, other.high) <= max(one.low, other.low):
+    if min(first.upper, second.upper) <= max(first.lower, second.lower):
         return math.inf, -math.inf
     edges = np.concatenate(
         [
             np.roll(points, -1, axis=0) - points
-            for points in (one.outline, other.outline)
+            for points in (first.outline, second.outline)
         ]
     )
     normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
-    moving_range = one.outline @ normals.T
-    fixed_range = other.outline @ normals.T
-    speed = normals @ way
+    moving_range = first.outline @ normals.T
+    fixed_range = second.outline @ normals.T
+    speed = normals @ direction
     reach = np.stack(
         [
             fixed_range.min(axis=0) - moving_range.max(axis=0),

@@ -21,23 +21,23 @@ import numpy.typing as npt
 from PIL import Image
 
 from advsearch.pictures import png_of
-from advsearch.scene.assets import Doubles, Floats, Shape
+from advsearch.scene.assets import Float32Array, Float64Array, Shape
 from advsearch.scene.color import linear_to_srgb
 
 # ---- The buffer of a binary glTF file, and the file around it ----
 
 # Component types: float32, uint32 and uint16.
 FLOAT = 5126
-WHOLE = 5125
-SHORT = 5123
+UNSIGNED_INT = 5125
+UNSIGNED_SHORT = 5123
 # Targets of buffer views: vertex attributes, and indices.
-CORNERS = 34962
-INDICES = 34963
+ARRAY_BUFFER = 34962
+ELEMENT_ARRAY_BUFFER = 34963
 
 
-def mime_type(picture: bytes) -> str:
+def find_mime_type(image_file: bytes) -> str:
     """Return the MIME type of a PNG or JPEG file."""
-    return "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg"
+    return "image/png" if image_file.startswith(b"\x89PNG") else "image/jpeg"
 
 
 class GlbBuffer:
@@ -48,22 +48,22 @@ class GlbBuffer:
 
     def __init__(self) -> None:
         self.data = bytearray()
-        self._known: dict[tuple[bytes, int | None], int] = {}
+        self._view_of_data: dict[tuple[bytes, int | None], int] = {}
         self.views: list[dict[str, int]] = []
         self.accessors: list[dict[str, Any]] = []
 
-    def view(self, data: bytes, target: int | None = None) -> int:
+    def add_view(self, data: bytes, target: int | None = None) -> int:
         """Append bytes, padded to four, and return the index of their view."""
         key = (data, target)
-        if key in self._known:
-            return self._known[key]
-        self._known[key] = len(self.views)
+        if key in self._view_of_data:
+            return self._view_of_data[key]
+        self._view_of_data[key] = len(self.views)
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
         self.views.append(view if target is None else {**view, "target": target})
         self.data += data + bytes(-len(data) % 4)
         return len(self.views) - 1
 
-    def accessor(
+    def add_accessor(
         self, values: npt.NDArray[Any], kind: str, *, bounds: bool = False
     ) -> int:
         """Append an array and return the index of its accessor.
@@ -73,10 +73,13 @@ class GlbBuffer:
             kind: glTF's type of a row, such as "VEC3".
             bounds: whether minimum and maximum are written too.
         """
-        integer_types = {np.dtype(np.uint32): WHOLE, np.dtype(np.uint16): SHORT}
+        integer_types = {
+            np.dtype(np.uint32): UNSIGNED_INT,
+            np.dtype(np.uint16): UNSIGNED_SHORT,
+        }
         component_type = integer_types.get(values.dtype, FLOAT)
-        target = CORNERS if component_type == FLOAT else INDICES
-        view = self.view(np.ascontiguousarray(values).tobytes(), target)
+        target = ARRAY_BUFFER if component_type == FLOAT else ELEMENT_ARRAY_BUFFER
+        view = self.add_view(np.ascontiguousarray(values).tobytes(), target)
         entry: dict[str, Any] = {
             "bufferView": view,
             "componentType": component_type,
@@ -89,7 +92,7 @@ class GlbBuffer:
         self.accessors.append(entry)
         return len(self.accessors) - 1
 
-    def file(self, header: dict[str, Any]) -> bytes:
+    def to_bytes(self, header: dict[str, Any]) -> bytes:
         """Return the complete file.
 
         The entries of the buffer are added to the header.
@@ -108,27 +111,27 @@ class GlbBuffer:
         return file_header + text + chunk_header + binary
 
 
-Levels = npt.NDArray[np.uint8]
+ByteImage = npt.NDArray[np.uint8]
 # Square root of the alpha of Mitsuba's clearcoat, 0.1.
 COAT_ROUGHNESS = 0.316
-PLAIN = 0.5  # specular of a surface whose index of refraction is 1.5
+DEFAULT_SPECULAR = 0.5  # specular of a surface whose index of refraction is 1.5
 # Limit of the sides of a texture in a file for the web, and the quality of its JPEG.
-WEB_SIDE = 1024
+WEB_TEXTURE_SIZE = 1024
 WEB_QUALITY = 90
 # Entry of a camera, of which only the pose of its node counts.
-CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
+CAMERA_ENTRY = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
 
 
-def glb(meshes: Sequence[Shape]) -> bytes:
+def encode_glb(meshes: Sequence[Shape]) -> bytes:
     """Return meshes as a binary glTF file with PNG textures."""
     buffer = GlbBuffer()
-    return buffer.file(_described(buffer, meshes, png_of))
+    return buffer.to_bytes(_make_header(buffer, meshes, png_of))
 
 
-def web_glb(
+def encode_web_glb(
     adversarial: Sequence[Shape],
     clean: Sequence[Shape],
-    camera: Doubles,
+    camera: Float64Array,
     note: str = "",
 ) -> bytes:
     """Return a small file with two scenes, "adversarial" and "clean".
@@ -142,14 +145,14 @@ def web_glb(
         note: text for readers, in `asset.extras`.
     """
     buffer = GlbBuffer()
-    header = _described(buffer, [*adversarial, *clean], _jpeg)
+    header = _make_header(buffer, [*adversarial, *clean], _encode_jpeg)
     # Rows: its axes, then its position.
     our_rows = camera[:3].T.astype(np.float32)
     columns = np.eye(4)
     # glTF's cameras look along their -z.
     signs = np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32)
-    columns[:, :3] = _y_up(our_rows * signs)
-    header["cameras"] = [CAMERA]
+    columns[:, :3] = _to_y_up(our_rows * signs)
+    header["cameras"] = [CAMERA_ENTRY]
     header["nodes"].append(
         {"name": "camera", "camera": 0, "matrix": columns.ravel().tolist()}
     )
@@ -161,18 +164,20 @@ def web_glb(
     ]
     if note:
         header["asset"]["extras"] = {"note": note}
-    return buffer.file(header)
+    return buffer.to_bytes(header)
 
 
-def _described(
-    made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Levels], bytes]
+def _make_header(
+    buffer: GlbBuffer,
+    meshes: Sequence[Shape],
+    encode_image: Callable[[ByteImage], bytes],
 ) -> dict[str, Any]:
     """Return the header of a file of meshes, whose data is added to a buffer.
 
     Args:
-        made: the buffer.
+        buffer: the buffer.
         meshes: one node each.
-        picture: encodes an image (H, W, 3).
+        encode_image: encodes an image (H, W, 3).
     """
     header: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
@@ -190,9 +195,9 @@ def _described(
         "images": [],
     }
     for index, shape in enumerate(meshes):
-        primitive = {**_add_geometry(made, shape), "material": index}
+        primitive = {**_add_geometry(buffer, shape), "material": index}
         header["meshes"].append({"name": shape.name, "primitives": [primitive]})
-        header["materials"].append(_add_material(header, made, shape, picture))
+        header["materials"].append(_add_material(header, buffer, shape, encode_image))
     used = {
         name
         for material in header["materials"]
@@ -213,13 +218,13 @@ def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
     ).astype(np.float32)
     uvs = np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)
     attributes = {
-        "POSITION": buffer.accessor(_y_up(mesh.vertices), "VEC3", bounds=True),
-        "NORMAL": buffer.accessor(_y_up(normals), "VEC3"),
-        "TEXCOORD_0": buffer.accessor(uvs, "VEC2"),
+        "POSITION": buffer.add_accessor(_to_y_up(mesh.vertices), "VEC3", bounds=True),
+        "NORMAL": buffer.add_accessor(_to_y_up(normals), "VEC3"),
+        "TEXCOORD_0": buffer.add_accessor(uvs, "VEC2"),
     }
     is_large = len(mesh.vertices) > np.iinfo(np.uint16).max
     index_type = np.uint32 if is_large else np.uint16
-    indices = buffer.accessor(mesh.faces.reshape(-1).astype(index_type), "SCALAR")
+    indices = buffer.add_accessor(mesh.faces.reshape(-1).astype(index_type), "SCALAR")
     return {"attributes": attributes, "indices": indices}
 
 
@@ -227,40 +232,45 @@ def _add_material(
     header: dict[str, Any],
     buffer: GlbBuffer,
     shape: Shape,
-    encode_image: Callable[[Levels], bytes],
+    encode_image: Callable[[ByteImage], bytes],
 ) -> dict[str, Any]:
     """Add the images of a shape, and return its material."""
-    color = _levels(shape.base_color)
+    color = _to_bytes(shape.base_color)
     if shape.opacity is None:
         encoded = encode_image(color)
     else:
-        encoded = _cut_out_png(color, _levels(shape.opacity))
-    material = _material(shape, _texture(header, buffer, encoded))
+        encoded = _encode_png_with_alpha(color, _to_bytes(shape.opacity))
+    material = _make_material(shape, _add_texture(header, buffer, encoded))
     if shape.normal_map is not None:
-        normals = encode_image(_levels(shape.normal_map))
-        material["normalTexture"] = _texture(header, buffer, normals)
+        normals = encode_image(_to_bytes(shape.normal_map))
+        material["normalTexture"] = _add_texture(header, buffer, normals)
     if shape.emission is not None:
         # A texture is at most 1, so the strength is an extension.
         strength = float(shape.emission.max())
         material["emissiveFactor"] = [1.0, 1.0, 1.0]
         relative = linear_to_srgb(shape.emission / np.float32(strength))
-        emission = encode_image(_levels(relative))
-        material["emissiveTexture"] = _texture(header, buffer, emission)
+        emission = encode_image(_to_bytes(relative))
+        material["emissiveTexture"] = _add_texture(header, buffer, emission)
         extensions = material.setdefault("extensions", {})
         extensions["KHR_materials_emissive_strength"] = {"emissiveStrength": strength}
     return material
 
 
-def _texture(header: dict[str, Any], made: GlbBuffer, picture: bytes) -> dict[str, int]:
+def _add_texture(
+    header: dict[str, Any], buffer: GlbBuffer, image_file: bytes
+) -> dict[str, int]:
     """Add an image file as a texture, and return the reference to it."""
     header["images"].append(
-        {"mimeType": mime_type(picture), "bufferView": made.view(picture)}
+        {
+            "mimeType": find_mime_type(image_file),
+            "bufferView": buffer.add_view(image_file),
+        }
     )
     header["textures"].append({"source": len(header["textures"]), "sampler": 0})
     return {"index": len(header["textures"]) - 1}
 
 
-def _material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
+def _make_material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
     """Return the material of a shape with a texture of its base color."""
     surface = shape.material
     material: dict[str, Any] = {"name": shape.name, "doubleSided": True}
@@ -273,9 +283,9 @@ def _material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
         "metallicFactor": surface.metallic,
     }
     extensions: dict[str, Any] = {}
-    if surface.specular != PLAIN:
+    if surface.specular != DEFAULT_SPECULAR:
         extensions["KHR_materials_specular"] = {
-            "specularFactor": min(1.0, surface.specular / PLAIN)
+            "specularFactor": min(1.0, surface.specular / DEFAULT_SPECULAR)
         }
     if surface.clearcoat > 0.0:
         extensions["KHR_materials_clearcoat"] = {
@@ -287,20 +297,20 @@ def _material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
     return material
 
 
-def _y_up(vectors: Floats) -> Floats:
+def _to_y_up(vectors: Float32Array) -> Float32Array:
     """Rotate vectors (N, 3) from z up and +x ahead to y up and +z ahead."""
     return np.stack([vectors[:, 1], vectors[:, 2], vectors[:, 0]], axis=1).astype(
         np.float32
     )
 
 
-def _levels(color: Floats) -> Levels:
+def _to_bytes(color: Float32Array) -> ByteImage:
     """Quantize values in [0, 1] to 8 bits."""
-    levels: Levels = np.uint8(np.clip(color, 0.0, 1.0) * 255.0 + 0.5)
+    levels: ByteImage = np.uint8(np.clip(color, 0.0, 1.0) * 255.0 + 0.5)
     return levels
 
 
-def _cut_out_png(color: Levels, opacity: Levels) -> bytes:
+def _encode_png_with_alpha(color: ByteImage, opacity: ByteImage) -> bytes:
     """Encode colors (H, W, 3) with an opacity, resized to their size, as PNG."""
     picture = Image.fromarray(color)
     picture.putalpha(
@@ -309,10 +319,10 @@ def _cut_out_png(color: Levels, opacity: Levels) -> bytes:
     return png_of(np.asarray(picture))
 
 
-def _jpeg(color: Levels) -> bytes:
+def _encode_jpeg(color: ByteImage) -> bytes:
     """Encode colors (H, W, 3) as JPEG, reduced to the size for the web."""
     file = io.BytesIO()
     picture = Image.fromarray(color)
-    picture.thumbnail((WEB_SIDE, WEB_SIDE))
+    picture.thumbnail((WEB_TEXTURE_SIZE, WEB_TEXTURE_SIZE))
     picture.save(file, "JPEG", quality=WEB_QUALITY, subsampling=0)
     return file.getvalue()

@@ -20,7 +20,7 @@ from torch import Tensor
 from advsearch.errors import InputError, UnknownNameError
 
 # estimators that take primal renders
-BY_DIFFERENCES = frozenset({"differences", "secant"})
+DIFFERENCE_ESTIMATORS = frozenset({"differences", "secant"})
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Budget:
     epsilon: float | None  # radius of the norm's ball in units of u; None for "box"
 
 
-WHOLE_RANGE = Budget("box", None)
+FULL_RANGE = Budget("box", None)
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Group:
     size: int  # number of coordinates
     # estimators, preferred first; empty for a discrete choice, which has no derivative
     valid: tuple[str, ...]
-    budget: Budget = WHOLE_RANGE  # how far they may go
+    budget: Budget = FULL_RANGE  # how far they may go
     periodic: bool = False  # 0 and 1 are the same value
     # number of options of a discrete choice; 0 for a continuous parameter
     options: int = 0
@@ -77,7 +77,7 @@ class Group:
     @property
     def step_reason(self) -> str:
         """Why the step has its width, as a text; empty where none is taken."""
-        if self.estimator not in BY_DIFFERENCES:
+        if self.estimator not in DIFFERENCE_ESTIMATORS:
             return ""
         if self.step == self.pixel:
             return "an outline moves by a pixel, or nothing moves"
@@ -89,7 +89,7 @@ class Group:
     @property
     def renders(self) -> int:
         """Primal renders that one gradient of this group takes."""
-        return 2 * self.size if self.estimator in BY_DIFFERENCES else 0
+        return 2 * self.size if self.estimator in DIFFERENCE_ESTIMATORS else 0
 
 
 ESTIMATORS: Mapping[str, str] = {
@@ -105,12 +105,12 @@ ESTIMATORS: Mapping[str, str] = {
     "none": "no derivative: a discrete choice, or switched off",
 }
 """Every estimator by the name that forces it."""
-BY_ADJOINT = frozenset({"adjoint", "material"})
+ADJOINT_ESTIMATORS = frozenset({"adjoint", "material"})
 # they need nothing but renders: right for any continuous coordinate
-ALWAYS_VALID = ("differences", "secant", "none")
+ALWAYS_VALID_ESTIMATORS = ("differences", "secant", "none")
 # number of coordinates above which differences are not compared with an adjoint: they
 # take two renders for each coordinate
-MANY = 16
+MAX_COMPARED_SIZE = 16
 DEFAULT_STEP = 0.05
 TURN_STEP = 0.005
 """Half-widths of differences in u for coordinates that move nothing in the image.
@@ -123,7 +123,7 @@ DEFAULT_PIXELS = 1.0
 STEP_RANGE = (1e-6, 0.15)  # smallest and largest step in u
 
 
-def steps_for(speeds: Tensor) -> Tensor:
+def compute_steps(speeds: Tensor) -> Tensor:
     """Return half-widths of differences in u over which outlines move by a pixel.
 
     The speeds of the outlines are in pixels per unit of u.
@@ -143,12 +143,12 @@ Over a pixel a classifier's loss is rough: its change over the 2 to 5 % of a ran
 a search goes at a time has another sign as often as not, and more noise hides it.
 `benchmarks/gradients.py --steps` shows that, and that 3 % is enough.
 """
-SEARCH_SHARE = 0.4
+SEARCH_FRACTION = 0.4
 """Largest fraction of the image over which such a step moves the fastest outline.
 
 Of an endless range, 3 % would move all objects out of the frame.
 """
-STORED = (
+STORED_FIELDS = (
     "control",
     "parameter",
     "size",
@@ -160,7 +160,7 @@ STORED = (
 )
 """What a run stores of one group of coordinates; see `Group`."""
 # fields that a plan for the same space copies
-CHOSEN = ("estimator", "step", "reason")
+RESTORED_FIELDS = ("estimator", "step", "reason")
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class GradientPlan:
     groups: tuple[Group, ...]  # of all controls, in the order of u
     spp: int | None = None  # samples per pixel of differences; None is the primal's
 
-    def having(self, *estimators: str) -> tuple[Group, ...]:
+    def groups_with(self, *estimators: str) -> tuple[Group, ...]:
         """Return the groups that use one of these estimators."""
         return tuple(group for group in self.groups if group.estimator in estimators)
 
@@ -180,17 +180,17 @@ class GradientPlan:
         return sum(group.renders for group in self.groups)
 
     @cached_property
-    def through(self) -> Tensor:
+    def autograd_mask(self) -> Tensor:
         """(d,) float32 mask of coordinates that are differentiated by autograd.
 
         It is 1 where the derivative runs back through scene inputs or the image.
         """
         mask = torch.zeros(sum(group.size for group in self.groups))
-        for group in self.having(*BY_ADJOINT, "image"):
+        for group in self.groups_with(*ADJOINT_ESTIMATORS, "image"):
             mask[group.coordinates] = 1.0
         return mask
 
-    def with_estimator(self, names: Mapping[str, str], reason: str) -> GradientPlan:
+    def force_estimators(self, names: Mapping[str, str], reason: str) -> GradientPlan:
         """Return the plan with the estimators of some groups forced.
 
         The names are those of estimators by `control.parameter`.
@@ -201,14 +201,14 @@ class GradientPlan:
         }
         return self._change_groups(lambda group: changes.get(group.name, {}))
 
-    def with_steps(self, factor: float) -> GradientPlan:
+    def scale_steps(self, factor: float) -> GradientPlan:
         """Return the plan with steps multiplied by a factor, within `STEP_RANGE`."""
         smallest, largest = STEP_RANGE
         return self._change_groups(
             lambda group: {"step": min(largest, max(smallest, group.step * factor))}
         )
 
-    def at_a_pixel(self) -> GradientPlan:
+    def with_pixel_steps(self) -> GradientPlan:
         """Return the plan with steps over which outlines move by a pixel.
 
         They are for smooth losses, which bend over wider ones.
@@ -220,14 +220,14 @@ class GradientPlan:
         groups = tuple(replace(group, **change(group)) for group in self.groups)
         return replace(self, groups=groups)
 
-    def restored(self, stored: Mapping[str, Any]) -> GradientPlan:
+    def restore(self, stored: Mapping[str, Any]) -> GradientPlan:
         """Return the plan with the choices of another plan for the same space.
 
         `stored` is what its `to_dict` has returned.
         """
         changes: dict[str, dict[str, Any]] = {}
         for group in stored["groups"]:
-            change = {name: group[name] for name in CHOSEN}
+            change = {name: group[name] for name in RESTORED_FIELDS}
             change["measured"] = group["variance_x_seconds"]
             changes[f"{group['control']}.{group['parameter']}"] = change
         plan = self._change_groups(lambda group: changes[group.name])
@@ -236,32 +236,34 @@ class GradientPlan:
     def to_dict(self) -> dict[str, Any]:
         """Return what a run stores of the plan.
 
-        It has its renders, and of each group `STORED` and the measurements.
+        It has its renders, and of each group `STORED_FIELDS` and the measurements.
         """
         groups = []
         for group in self.groups:
-            entries = {name: getattr(group, name) for name in STORED}
+            entries = {name: getattr(group, name) for name in STORED_FIELDS}
             entries["valid"] = list(group.valid)
             entries["variance_x_seconds"] = dict(group.measured)
             groups.append(entries)
         return {"renders_per_gradient": self.renders, "spp": self.spp, "groups": groups}
 
 
-def compared(valid: Sequence[str], size: int) -> tuple[str, ...]:
+def select_compared(valid: Sequence[str], size: int) -> tuple[str, ...]:
     """Return which of the valid estimators of a group are worth a measurement.
 
     `size` is its number of coordinates.
     """
-    adjoints = tuple(estimator for estimator in valid if estimator in BY_ADJOINT)
-    return adjoints if adjoints and size > MANY else tuple(valid)
+    adjoints = tuple(
+        estimator for estimator in valid if estimator in ADJOINT_ESTIMATORS
+    )
+    return adjoints if adjoints and size > MAX_COMPARED_SIZE else tuple(valid)
 
 
-def first_plan(
+def make_first_plan(
     groups: Sequence[Group],
     steps: Tensor,
     forced: Mapping[str, str] | None = None,
     spp: int | None = None,
-    across: float = math.inf,
+    image_size: float = math.inf,
 ) -> GradientPlan:
     """Return the plan before anything was measured.
 
@@ -273,7 +275,7 @@ def first_plan(
         forced: estimators by "control.parameter", "control", or "*" for all groups
             where it is valid.
         spp: samples per pixel of differences.
-        across: pixels of the longer side of the image.
+        image_size: pixels of the longer side of the image.
 
     Raises:
         InputError: an estimator is unknown, or not valid where it was forced by name.
@@ -291,19 +293,19 @@ def first_plan(
         if name != "*" and name not in names:
             raise UnknownNameError("control in `estimators`", name, sorted(names))
     return GradientPlan(
-        tuple(_plan_group(group, steps, forced, across) for group in groups), spp
+        tuple(_plan_group(group, steps, forced, image_size) for group in groups), spp
     )
 
 
 def _plan_group(
-    group: Group, steps: Tensor, forced: Mapping[str, str], across: float
+    group: Group, steps: Tensor, forced: Mapping[str, str], image_size: float
 ) -> Group:
-    """Return a group with its preferred or forced estimator; see `first_plan`."""
+    """Return a group with its preferred or forced estimator; see `make_first_plan`."""
     pixel = float(steps[group.coordinates].min()) if group.size else 0.0
     step = pixel
     moves_outlines = not {"adjoint", "image"} & {*group.valid}
     if group.size == 1 and moves_outlines:
-        step = max(pixel, min(SEARCH_STEP, SEARCH_SHARE * across * pixel))
+        step = max(pixel, min(SEARCH_STEP, SEARCH_FRACTION * image_size * pixel))
     group = replace(group, pixel=pixel)
     if not group.valid:
         return replace(
@@ -311,7 +313,7 @@ def _plan_group(
         )
     by_name = forced.get(group.name) or forced.get(group.control)
     if by_name is not None:
-        allowed = dict.fromkeys((*group.valid, *ALWAYS_VALID))
+        allowed = dict.fromkeys((*group.valid, *ALWAYS_VALID_ESTIMATORS))
         if by_name not in allowed:
             raise InputError(
                 f"`estimators` {group.name}={by_name}: not valid there; expected one "
@@ -321,7 +323,7 @@ def _plan_group(
             group, estimator=by_name, step=step, reason="forced by name", is_forced=True
         )
     for_all = forced.get("*", "")
-    has_alternative = for_all in ALWAYS_VALID and "image" not in group.valid
+    has_alternative = for_all in ALWAYS_VALID_ESTIMATORS and "image" not in group.valid
     if for_all in group.valid or has_alternative:
         return replace(
             group, estimator=for_all, step=step, reason="forced for all", is_forced=True
@@ -337,7 +339,7 @@ def _plan_group(
 Backward = Callable[[Any, Tensor], tuple[Tensor | None, ...]]
 
 
-def first_order(backward: Backward) -> Backward:
+def forbid_second_derivatives(backward: Backward) -> Backward:
     """Make what a backward pass returns refuse to be differentiated again.
 
     Torch's own `once_differentiable` refuses only where the engine runs its node:

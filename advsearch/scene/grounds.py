@@ -16,20 +16,20 @@ import torch
 from torch import Tensor
 
 from advsearch.scene import settings
-from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Mesh
-from advsearch.scene.geometry import camera_to_world, middle
+from advsearch.scene.assets import EnvironmentAsset, Float32Array, Float64Array, Mesh
+from advsearch.scene.geometry import camera_to_world, compute_center
 from advsearch.scene.parts import MeshPart, Place
-from advsearch.scene.places.place_file import lay_place, load_bundled_place
+from advsearch.scene.places.place_file import load_bundled_place, make_place_parts
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
 # shares of linear red, green and blue in luminance (Rec. ITU-R BT.709)
 LUMINANCE = (0.2126, 0.7152, 0.0722)
-SECTORS = 128
-RINGS = 64
-NEAREST = 0.01
-FARTHEST = 1000.0
+N_SECTORS = 128
+N_RINGS = 64
+MIN_RING_RADIUS = 0.01
+MAX_RING_RADIUS = 1000.0
 """Radii of the innermost and the outermost ring of vertices, in heights of the camera.
 Beyond, the map itself is seen, less than 0.06 degrees below the horizon.
 """
@@ -63,11 +63,11 @@ class Photograph:
     degrees.
     """
 
-    def __init__(self, radiance: Floats, height: float, rotation: float) -> None:
+    def __init__(self, radiance: Float32Array, height: float, rotation: float) -> None:
         self._rows = radiance.shape[0]
         self._first = (self._rows - 1) // 2
         self.mesh = self._make_mesh(height, rotation)
-        self.base = self.reflectance(
+        self.base_color = self.compute_reflectance(
             torch.from_numpy(np.asarray(radiance, dtype=np.float32))
         )
 
@@ -76,8 +76,10 @@ class Photograph:
 
         Their texture coordinates are those of the lower half of the map.
         """
-        radii = np.concatenate([[0.0], np.geomspace(NEAREST, FARTHEST, RINGS)])
-        turns = np.linspace(0.0, 1.0, SECTORS + 1)
+        radii = np.concatenate(
+            [[0.0], np.geomspace(MIN_RING_RADIUS, MAX_RING_RADIUS, N_RINGS)]
+        )
+        turns = np.linspace(0.0, 1.0, N_SECTORS + 1)
         radius, turn = np.meshgrid(radii, turns, indexing="ij")
         azimuth = 0.5 * math.pi - 2.0 * math.pi * turn + math.radians(rotation)
         vertices = height * np.stack(
@@ -97,7 +99,7 @@ class Photograph:
             uvs.reshape(-1, 2).astype(np.float32),
         )
 
-    def reflectance(self, radiance: Tensor) -> Tensor:
+    def compute_reflectance(self, radiance: Tensor) -> Tensor:
         """Return the plane's texture (h, W, 3) for a map of any size.
 
         0 where no light comes from above. Differentiable; row 0 is the horizon, the
@@ -112,7 +114,7 @@ class Photograph:
         lower_half = radiance[upper] + fraction * (
             radiance[upper + 1] - radiance[upper]
         )
-        arriving = irradiance(radiance)
+        arriving = compute_irradiance(radiance)
         return torch.where(
             arriving > 0.0, lower_half * math.pi / arriving.clamp_min(1e-30), 0.0
         )
@@ -120,22 +122,22 @@ class Photograph:
 
 def _make_ring_faces() -> npt.NDArray[np.uint32]:
     """Return the faces (F, 3) of the rings; the innermost are single triangles."""
-    ring_starts = np.arange(RINGS)[:, None] * (SECTORS + 1)
-    inner = (ring_starts + np.arange(SECTORS)).ravel()
-    outer = inner + SECTORS + 1
+    ring_starts = np.arange(N_RINGS)[:, None] * (N_SECTORS + 1)
+    inner = (ring_starts + np.arange(N_SECTORS)).ravel()
+    outer = inner + N_SECTORS + 1
     first = np.stack([outer, inner, outer + 1], axis=1)
-    second = np.stack([inner, inner + 1, outer + 1], axis=1)[SECTORS:]
+    second = np.stack([inner, inner + 1, outer + 1], axis=1)[N_SECTORS:]
     return np.concatenate([first, second]).astype(np.uint32)
 
 
 @lru_cache(maxsize=4)
-def photograph_of(
+def get_photograph(
     environment: EnvironmentAsset, height: float, rotation: float
 ) -> Photograph:
     return Photograph(environment.radiance, height, rotation)
 
 
-def irradiance(radiance: Tensor) -> Tensor:
+def compute_irradiance(radiance: Tensor) -> Tensor:
     """Return the irradiance (3,) of a map (H, W, 3) on unshadowed level ground.
 
     Differentiable.
@@ -150,9 +152,9 @@ def irradiance(radiance: Tensor) -> Tensor:
     return (radiance.sum(dim=1) * weights[:, None]).sum(dim=0)
 
 
-def paved(scene: SceneDescription) -> bool:
+def is_paved(scene: SceneDescription) -> bool:
     """Return whether the object stands on a road, or on the ground of a place."""
-    return any(part.is_ground for part in scene.around.values())
+    return any(part.is_ground for part in scene.surrounding_meshes.values())
 
 
 def has_lanes(scene: SceneDescription) -> bool:
@@ -163,14 +165,14 @@ def has_lanes(scene: SceneDescription) -> bool:
 
 LANE_WIDTH = 3.5  # metres, of the lane that the object stands in where no place says it
 # metres above the road up to which a camera in the lane may be that of a car
-CAR_CAMERA = 2.5
+MAX_CAR_CAMERA_HEIGHT = 2.5
 
 
-def is_against_traffic(scene: SceneDescription, camera: Doubles) -> bool:
+def is_against_traffic(scene: SceneDescription, camera: Float64Array) -> bool:
     """Return whether a camera (4, 4) drives in the object's lane towards its front."""
     if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
         return False
-    ahead, aside = (camera[:2, 3] - middle(scene)[:2]) * scene.metres
+    ahead, aside = (camera[:2, 3] - compute_center(scene)[:2]) * scene.metres
     height = float(camera[2, 3]) * scene.metres
     place = find_place(scene)
     width = (
@@ -178,10 +180,12 @@ def is_against_traffic(scene: SceneDescription, camera: Doubles) -> bool:
         if place is None or place.file.lane_width is None
         else place.file.lane_width
     )
-    return bool(ahead > 0.0 and abs(aside) <= width / 2.0 and height <= CAR_CAMERA)
+    return bool(
+        ahead > 0.0 and abs(aside) <= width / 2.0 and height <= MAX_CAR_CAMERA_HEIGHT
+    )
 
 
-def traffic_remark(scene: SceneDescription) -> str:
+def make_traffic_remark(scene: SceneDescription) -> str:
     """Return what users are told of a camera that drives against the traffic."""
     behind = (180.0 - scene.azimuth_zero) % 360.0
     return (
@@ -191,12 +195,15 @@ def traffic_remark(scene: SceneDescription) -> str:
     )
 
 
-def enclosed(scene: SceneDescription) -> bool:
+def is_enclosed(scene: SceneDescription) -> bool:
     """Return whether much stands around the object: light paths seldom leave the scene."""
-    return any(part.laid and not part.is_ground for part in scene.around.values())
+    return any(
+        part.is_laid_ground and not part.is_ground
+        for part in scene.surrounding_meshes.values()
+    )
 
 
-PLACES: Mapping[str, tuple[str, str | None]] = {
+PLACE_BY_GROUND_KIND: Mapping[str, tuple[str, str | None]] = {
     settings.DRY_ROAD: ("road", None),
     settings.WET_ROAD: ("road", "wet"),
     settings.DRY_AVENUE: ("avenue", None),
@@ -220,7 +227,9 @@ def find_ground_kind(scene: SceneDescription) -> str | None:
         return None
     if requested is not None:
         return settings.GROUND_KINDS[int(requested)]
-    if scene.environment is None or not scene.given.isdisjoint(settings.TABLE_SETTINGS):
+    if scene.environment is None or not scene.requested.isdisjoint(
+        settings.TABLE_SETTINGS
+    ):
         return None
     return scene.environment.ground
 
@@ -228,7 +237,12 @@ def find_ground_kind(scene: SceneDescription) -> str | None:
 def find_place(scene: SceneDescription) -> Place | None:
     """Return the place that a scene has around its object; None where it has none."""
     return next(
-        (part.place for part in scene.around.values() if part.place is not None), None
+        (
+            part.place
+            for part in scene.surrounding_meshes.values()
+            if part.place is not None
+        ),
+        None,
     )
 
 
@@ -239,21 +253,27 @@ def load_requested_place(scene: SceneDescription) -> Place | None:
     """
     kind = find_ground_kind(scene)
     if kind is not None:
-        return load_bundled_place(*PLACES[kind]) if kind in PLACES else None
+        return (
+            load_bundled_place(*PLACE_BY_GROUND_KIND[kind])
+            if kind in PLACE_BY_GROUND_KIND
+            else None
+        )
     light = scene.environment
-    is_described = scene.number("ground.size") <= 0.0 or not scene.given.isdisjoint(
+    is_described = scene.number("ground.size") <= 0.0 or not scene.requested.isdisjoint(
         settings.TABLE_SETTINGS
     )
     return None if light is None or is_described else light.place
 
 
-def on_its_ground(scene: SceneDescription) -> SceneDescription:
+def with_requested_ground(scene: SceneDescription) -> SceneDescription:
     """Return the scene with the road or the place that its settings ask for.
 
     Another one that it had is left out.
     """
     others = tuple(
-        part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid)
+        part
+        for part in scene.parts
+        if not (isinstance(part, MeshPart) and part.is_laid_ground)
     )
     place = load_requested_place(scene)
     if place is None:
@@ -264,13 +284,15 @@ def on_its_ground(scene: SceneDescription) -> SceneDescription:
     unit = None if light is None else light.candelas
     is_dark = False
     if light is not None and unit is not None and place.file.lamps:
-        arriving = irradiance(torch.from_numpy(light.radiance.copy()))
-        is_dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
-    place_parts = lay_place(place, scene.metres, unit, is_dark=is_dark)
+        arriving = compute_irradiance(torch.from_numpy(light.radiance.copy()))
+        is_dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK_ILLUMINANCE
+    place_parts = make_place_parts(place, scene.metres, unit, is_dark=is_dark)
     return replace(scene, parts=(*others, *place_parts))
 
 
-DUSK = 70.0  # illuminance of the open sky at which street lamps are switched on, lux
+DUSK_ILLUMINANCE = (
+    70.0  # illuminance of the open sky at which street lamps are switched on, lux
+)
 
 
 # --------------------------------------------------------------------------------------
@@ -294,12 +316,12 @@ DUSK = 70.0  # illuminance of the open sky at which street lamps are switched on
 # shown h0 / R below it. Up to
 #   h = 2 h0 it is at most twice too high.
 
-FACTOR = 2.0  # how much too large, or too high, what stands around may be
+MAX_SCALE_ERROR = 2.0  # how much too large, or too high, what stands around may be
 # how far from a photograph's camera its floor is empty, in heights of it, where nothing
 # says so
-RADIUS = 5.0
+DEFAULT_EMPTY_RADIUS = 5.0
 # degrees that a street's map may be turned by: its houses then stand beside its road
-TURNED = 2.0
+MAX_MAP_ROTATION = 2.0
 Box = tuple[float, float, float, float]
 """From and to in x, from and to in y, metres or object sizes, with the object at (0,
 0).
@@ -315,9 +337,11 @@ class Surroundings:
 
     # above the ground from which it was taken; infinite where nothing near is shown
     height: float
-    stands: Box | float  # how far away what stands around is
-    laid: Box | float  # how far the ground reaches that is laid under the object
-    turned: float = 0.0  # degrees that the picture is turned by against the ground
+    nearest_distance: Box | float  # how far away what stands around is
+    ground_extent: (
+        Box | float
+    )  # how far the ground reaches that is laid under the object
+    rotation: float = 0.0  # degrees that the picture is turned by against the ground
 
 
 class CameraView(NamedTuple):
@@ -332,26 +356,31 @@ class CameraView(NamedTuple):
     towards: float
     distance: float
     height: float
-    lowest: float
+    lower_angle: float
 
 
-def valid(environment: Surroundings, camera: CameraView) -> tuple[float, float]:
+def find_valid_range(
+    environment: Surroundings, camera: CameraView
+) -> tuple[float, float]:
     """Return up to which distance and height a picture fits a camera.
 
     In the lengths of `environment`, infinite without a bound, 0 where it fits nowhere;
     see above. The camera's own distance does not count.
     """
-    if abs((environment.turned + 180.0) % 360.0 - 180.0) > TURNED:
+    if abs((environment.rotation + 180.0) % 360.0 - 180.0) > MAX_MAP_ROTATION:
         return 0.0, 0.0
-    behind = (FACTOR - 1.0) * _reach_of_area(environment.stands, camera.towards)
+    behind = (MAX_SCALE_ERROR - 1.0) * _reach_of_area(
+        environment.nearest_distance, camera.towards
+    )
     unseen = (
         math.inf
-        if camera.lowest <= 0.0
-        else camera.height / math.tan(math.radians(min(camera.lowest, 179.0)))
+        if camera.lower_angle <= 0.0
+        else camera.height / math.tan(math.radians(min(camera.lower_angle, 179.0)))
     )
     return max(
-        0.0, min(behind, _reach_of_area(environment.laid, camera.azimuth) + unseen)
-    ), FACTOR * environment.height
+        0.0,
+        min(behind, _reach_of_area(environment.ground_extent, camera.azimuth) + unseen),
+    ), MAX_SCALE_ERROR * environment.height
 
 
 def _reach_of_area(area: Box | float, azimuth: float) -> float:
@@ -363,18 +392,18 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
     return min(x_reach, (area[3] if y > 0.0 else -area[2]) / max(abs(y), 1e-12))
 
 
-def surroundings_of(scene: SceneDescription) -> Surroundings | None:
+def find_surroundings(scene: SceneDescription) -> Surroundings | None:
     """Return what is known of the place in a scene's environment.
 
     None where nothing of it has to fit a ground.
     """
     environment = scene.environment
     # what encloses the object is geometry, true from everywhere
-    if environment is None or scene.backdrop or enclosed(scene):
+    if environment is None or scene.backdrop or is_enclosed(scene):
         return None
     place = find_place(scene)
     extent: Box | float = math.inf if place is None else bound_ground(place)
-    bundled = PLACES.get(environment.ground or "")
+    bundled = PLACE_BY_GROUND_KIND.get(environment.ground or "")
     pictured_place = (
         environment.place if bundled is None else load_bundled_place(*bundled)
     )
@@ -390,13 +419,13 @@ def surroundings_of(scene: SceneDescription) -> Surroundings | None:
             extent,
             scene.number("environment.rotation"),
         )
-    if environment.photographed and (paved(scene) or scene.photograph is not None):
+    if environment.photographed and (is_paved(scene) or scene.photograph is not None):
         height = scene.capture_height * scene.metres
         radius = scene.values.get("ground.radius")
         return Surroundings(
-            height, RADIUS * height if radius is None else radius, extent
+            height, DEFAULT_EMPTY_RADIUS * height if radius is None else radius, extent
         )
-    return Surroundings(math.inf, math.inf, extent) if paved(scene) else None
+    return Surroundings(math.inf, math.inf, extent) if is_paved(scene) else None
 
 
 def bound_ground(place: Place) -> Box:
@@ -409,8 +438,10 @@ def bound_ground(place: Place) -> Box:
     return x0, x1, y0, y1
 
 
-def view_of(
-    scene: SceneDescription, to_world: Doubles | None = None, fov: float | None = None
+def make_camera_view(
+    scene: SceneDescription,
+    to_world: Float64Array | None = None,
+    fov: float | None = None,
 ) -> CameraView:
     """Return how a scene is looked at.
 
@@ -434,7 +465,7 @@ def view_of(
     return CameraView(azimuth, direction, math.hypot(x, y), float(z), lowest)
 
 
-def place_of(view: CameraView) -> Doubles:
+def get_camera_position(view: CameraView) -> Float64Array:
     """Return where a camera is, (3,) metres, with the object at the origin."""
     azimuth = math.radians(view.azimuth)
     return np.array(
@@ -446,30 +477,32 @@ def place_of(view: CameraView) -> Doubles:
     )
 
 
-def past(
-    scene: SceneDescription, views: Sequence[CameraView], *, turns: bool = False
+def list_view_remarks(
+    scene: SceneDescription, views: Sequence[CameraView], *, rotates_map: bool = False
 ) -> tuple[str, ...]:
     """Return remarks where views go past what an environment's picture is valid for.
 
     Args:
         scene: that is looked at.
         views: at least one.
-        turns: whether the map is rotated from view to view.
+        rotates_map: whether the map is rotated from view to view.
     """
-    surroundings = surroundings_of(scene)
+    surroundings = find_surroundings(scene)
     place = find_place(scene)
-    outside = () if place is None else remark_outside(scene, place, views)
+    outside = () if place is None else list_outside_remarks(scene, place, views)
     if outside or surroundings is None:
         return outside
     name = scene.environment_name
-    is_against_road = valid(surroundings, views[0]) == (0.0, 0.0)
-    if is_against_road or (turns and isinstance(surroundings.stands, tuple)):
+    is_against_road = find_valid_range(surroundings, views[0]) == (0.0, 0.0)
+    if is_against_road or (
+        rotates_map and isinstance(surroundings.nearest_distance, tuple)
+    ):
         return (
             f"{name}: its houses are a picture, which `environment.rotation` turns "
             "against the road: they then stand "
             "across it; leave the rotation out",
         )
-    limits = [valid(surroundings, view) for view in views]
+    limits = [find_valid_range(surroundings, view) for view in views]
     beyond = [
         view
         for view, (distance, height) in zip(views, limits, strict=True)
@@ -498,7 +531,7 @@ def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
     """Return up to where an environment's picture fits a camera, for a message.
 
     Args:
-        limits: distance and height of each view, see `valid`.
+        limits: distance and height of each view, see `find_valid_range`.
         unit: of these.
     """
     smallest = min(limits)[0]
@@ -511,7 +544,7 @@ def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
     return f"{distance} away{height}"
 
 
-def remark_outside(
+def list_outside_remarks(
     scene: SceneDescription, place: Place, views: Sequence[CameraView]
 ) -> tuple[str, ...]:
     """Return a remark where views are outside of what the place is valid for.
@@ -522,7 +555,7 @@ def remark_outside(
         views: at least one.
     """
     bounds = [(axis, limits) for axis, limits in place.file.valid if limits is not None]
-    positions = np.array([place_of(view) for view in views])
+    positions = np.array([get_camera_position(view) for view in views])
     is_outside = np.zeros(len(views), bool)
     for axis, (lower, upper) in bounds:
         coordinate = positions[:, "xyz".index(axis)]

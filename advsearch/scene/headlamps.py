@@ -32,18 +32,18 @@ from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import (
-    Doubles,
-    Floats,
-    Ints,
+    Float32Array,
+    Float64Array,
+    IntArray,
     Material,
     Mesh,
-    face_vectors,
-    pose_of,
+    compute_area_vectors,
+    make_pose,
 )
 from advsearch.scene.grounds import LUMINANCE
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart, ScenePart
 from advsearch.scene.settings import LAMPS
-from advsearch.scene.things import ThingPart, heights_over
+from advsearch.scene.things import ThingPart, find_triangle_heights
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -51,39 +51,39 @@ if TYPE_CHECKING:
 # degrees above the horizon at which the low beam has half of what it has below
 CUT_OFF = -0.57
 # tangent of the table's angle to either side, and its size; texels are square
-SIDES = 1.0
+TABLE_HALF_WIDTH = 1.0
 ROWS = 512
 COLUMNS = 896
 # candela ahead of the glass of one headlamp, and behind that of one tail lamp
-GLASS = 250.0
-REAR = 10.0
+HEADLAMP_CANDELA = 250.0
+TAILLAMP_CANDELA = 10.0
 WHITE, RED = (
     color / (color @ np.array(LUMINANCE))
     for color in np.array([[1.0, 0.95, 0.86], [1.0, 0.0, 0.0]])
 )
 """Linear colours with a luminance of 1."""
-NAMED = {
+MATERIAL_NAMES = {
     "headlamps": re.compile(r"head[ _-]?(light|lamp)", re.IGNORECASE),
     "taillamps": re.compile(r"(tail|rear)[ _-]?(light|lamp)", re.IGNORECASE),
 }
 """What the materials of lamps are called in a file."""
-HEIGHTS = {"headlamps": (0.65, 0.45), "taillamps": (0.85, 0.6)}
-ASIDE = 0.36
-RADIUS = 0.07
+LAMP_HEIGHTS = {"headlamps": (0.65, 0.45), "taillamps": (0.85, 0.6)}
+LAMP_OFFSET = 0.36
+LAMP_RADIUS = 0.07
 """Where a car has lamps whose file names none: metres above its foot, or that share of
 its height where it is lower; to either side, as a share of its width; and how large
 they are, metres.
 """
-SPOKES = 12
-EGO = (1.7, 0.62, 0.65)
+N_SPOKES = 12
+EGO_LAMP_POSITION = (1.7, 0.62, 0.65)
 """Where the headlamps of the camera's own car are: metres before the camera, to either
 side, above the ground.
 """
-CLEAR = Material(roughness=0.06, specular=0.6)
-OUT = 0.004  # how far glass stands out from what it lies on, metres
+GLASS_MATERIAL = Material(roughness=0.06, specular=0.6)
+GLASS_OFFSET = 0.004  # how far glass stands out from what it lies on, metres
 
 
-def candela(kind: str, h: Doubles, v: Doubles) -> Doubles:
+def compute_candela(kind: str, h: Float64Array, v: Float64Array) -> Float64Array:
     """Return the luminous intensity of one headlamp, "low" or "high"; see above.
 
     `h` and `v` are degrees aside and up.
@@ -101,28 +101,29 @@ def candela(kind: str, h: Doubles, v: Doubles) -> Doubles:
 
 
 @lru_cache(maxsize=2)
-def table(kind: str) -> Floats:
+def make_candela_table(kind: str) -> Float32Array:
     """Return the intensities (ROWS, COLUMNS) of one headlamp on a plane before it.
 
     In candela; row 0 on top.
     """
-    up = SIDES * ROWS / COLUMNS
+    up = TABLE_HALF_WIDTH * ROWS / COLUMNS
     aside, above = np.meshgrid(
-        SIDES * (2.0 * (np.arange(COLUMNS) + 0.5) / COLUMNS - 1.0),
+        TABLE_HALF_WIDTH * (2.0 * (np.arange(COLUMNS) + 0.5) / COLUMNS - 1.0),
         up * (1.0 - 2.0 * (np.arange(ROWS) + 0.5) / ROWS),
     )
-    values = candela(
+    values = compute_candela(
         kind,
         np.degrees(np.arctan(aside)),
         np.degrees(np.arctan2(above, np.hypot(1.0, aside))),
     )
     border = np.minimum(
-        (SIDES - np.abs(aside)) / (0.2 * SIDES), (up - np.abs(above)) / (0.2 * up)
+        (TABLE_HALF_WIDTH - np.abs(aside)) / (0.2 * TABLE_HALF_WIDTH),
+        (up - np.abs(above)) / (0.2 * up),
     )
     return np.asarray(values * border.clip(0.0, 1.0), np.float32)
 
 
-def with_lamps(scene: SceneDescription) -> SceneDescription:
+def add_lamps(scene: SceneDescription) -> SceneDescription:
     """Return the scene with the lamps that are on, and no others.
 
     Those of its object, its things and the car of its camera.
@@ -135,8 +136,8 @@ def with_lamps(scene: SceneDescription) -> SceneDescription:
         part for part in scene.parts if not isinstance(part, (BeamLamp, LampGlass))
     )
     kind_by_carrier = {
-        "object": chosen(scene, "object.lamps"),
-        CAMERA: chosen(scene, "camera.lamps"),
+        "object": get_lamp_kind(scene, "object.lamps"),
+        CAMERA: get_lamp_kind(scene, "camera.lamps"),
     }
     for part in others:
         if isinstance(part, ThingPart):
@@ -186,7 +187,7 @@ def _check_units(scene: SceneDescription, carrier: str) -> float:
     return unit
 
 
-def chosen(scene: SceneDescription, setting: str) -> str:
+def get_lamp_kind(scene: SceneDescription, setting: str) -> str:
     """Return the word that a setting of lamps has."""
     return LAMPS[int(scene.values.get(setting) or 0.0)]
 
@@ -204,7 +205,7 @@ def _make_lamps(
         weight: of each beam, see `BeamLamp`.
     """
     if carrier == CAMERA:
-        ahead, aside, above = EGO
+        ahead, aside, above = EGO_LAMP_POSITION
         positions = [
             np.array([ahead, side * aside, above]) / scene.metres
             for side in (1.0, -1.0)
@@ -214,26 +215,28 @@ def _make_lamps(
         metres = part.metres if isinstance(part, ThingPart) else scene.metres
         # a metre in its coordinates
         step = float(np.ptp(part.mesh.vertices, axis=0).max()) / metres
-        front = _make_glass(part, "headlamps", 1.0, step, GLASS / unit * WHITE)
+        front = _make_glass(
+            part, "headlamps", 1.0, step, HEADLAMP_CANDELA / unit * WHITE
+        )
         yield from (
             front,
-            _make_glass(part, "taillamps", -1.0, step, REAR / unit * RED),
+            _make_glass(part, "taillamps", -1.0, step, TAILLAMP_CANDELA / unit * RED),
         )
         positions = _find_beam_positions(front.mesh.vertices, step)
     red, green, blue = map(float, WHITE / (unit * scene.metres**2))
     for name, position in zip(("left", "right"), positions, strict=True):
-        seat = pose_of([(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], position)
+        seat = make_pose([(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], position)
         yield BeamLamp(
             f"{carrier}-{name}-beam",
             carrier,
             seat,
-            table(kind),
+            make_candela_table(kind),
             (red, green, blue),
             weight,
         )
 
 
-def _find_beam_positions(vertices: Floats, step: float) -> list[Doubles]:
+def _find_beam_positions(vertices: Float32Array, step: float) -> list[Float64Array]:
     """Return where the left and the right beam start, before the glass of a car.
 
     Args:
@@ -247,12 +250,12 @@ def _find_beam_positions(vertices: Floats, step: float) -> list[Doubles]:
         lower = lamp.min(axis=0)
         upper = lamp.max(axis=0)
         middle = (lower + upper)[1:] / 2.0
-        positions.append(np.array([upper[0] + 5.0 * OUT * step, *middle]))
+        positions.append(np.array([upper[0] + 5.0 * GLASS_OFFSET * step, *middle]))
     return positions
 
 
 def _make_glass(
-    part: MeshPart, where: str, ahead: float, step: float, power: Doubles
+    part: MeshPart, where: str, ahead: float, step: float, power: Float64Array
 ) -> LampGlass:
     """Return the glass of a car's two headlamps or tail lamps.
 
@@ -261,7 +264,7 @@ def _make_glass(
 
     Args:
         part: the car.
-        where: of `NAMED`.
+        where: of `MATERIAL_NAMES`.
         ahead: 1 for lamps that shine along +x, -1 along -x.
         step: a metre in the car's coordinates.
         power: (3,) the radiance times square metres that each of the two sends
@@ -271,7 +274,7 @@ def _make_glass(
     named_faces = [
         faces
         for name, faces in mesh.materials.items()
-        if NAMED[where].search(name) and len(faces)
+        if MATERIAL_NAMES[where].search(name) and len(faces)
     ]
     if named_faces:
         lies_on = np.concatenate(named_faces)
@@ -280,7 +283,7 @@ def _make_glass(
         )
         faces = faces.reshape(-1, 3)
         normals = mesh.normals[follows].astype(np.float64)
-        vertices = mesh.vertices[follows] + OUT * step * normals
+        vertices = mesh.vertices[follows] + GLASS_OFFSET * step * normals
     else:
         vertices, faces = _make_disks(mesh, where, ahead, step)
         normals = np.tile([[ahead, 0.0, 0.0]], (len(vertices), 1))
@@ -289,7 +292,7 @@ def _make_glass(
             vertices[faces].mean(axis=1)
         )[1]
     corners = vertices[faces] / step
-    facing_area = ahead * face_vectors(corners)[:, 0] / 2.0
+    facing_area = ahead * compute_area_vectors(corners)[:, 0] / 2.0
     shape = (
         vertices.astype(np.float32),
         faces.astype(np.uint32),
@@ -301,22 +304,22 @@ def _make_glass(
         name=f"{part.name}-{where}",
         mesh=Mesh(*shape),
         base_color=np.tile((0.8 * power / power.max()).astype(np.float32), (2, 2, 1)),
-        material=CLEAR,
+        material=GLASS_MATERIAL,
         emission=radiance.astype(np.float32)[None, None],
         carrier=part.name,
-        follows=follows,
-        lies_on=lies_on,
+        vertex_of_carrier=follows,
+        face_of_carrier=lies_on,
     )
 
 
 def _make_disks(
     mesh: Mesh, where: str, ahead: float, step: float
-) -> tuple[Doubles, Ints]:
+) -> tuple[Float64Array, IntArray]:
     """Make two disks before what is foremost of a car, for lamps without a material.
 
     Args:
         mesh: of the car.
-        where: of `NAMED`.
+        where: of `MATERIAL_NAMES`.
         ahead: 1 for lamps that shine along +x, -1 along -x.
         step: a metre in the car's coordinates.
 
@@ -326,30 +329,34 @@ def _make_disks(
     corners = mesh.vertices[mesh.faces].astype(np.float64) * [ahead, 1.0, 1.0]
     lower = corners.min(axis=(0, 1))
     upper = corners.max(axis=(0, 1))
-    height, height_fraction = HEIGHTS[where]
+    height, height_fraction = LAMP_HEIGHTS[where]
     width = upper[1] - lower[1]
-    turn = ahead * np.linspace(0.0, 2.0 * np.pi, SPOKES, endpoint=False)
+    turn = ahead * np.linspace(0.0, 2.0 * np.pi, N_SPOKES, endpoint=False)
     circle = np.stack([0.0 * turn, np.cos(turn), np.sin(turn)], axis=1)
-    rim = min(RADIUS * step, 0.1 * width) * circle
-    vertices = list[Doubles]()
+    rim = min(LAMP_RADIUS * step, 0.1 * width) * circle
+    vertices = list[Float64Array]()
     for side in (1.0, -1.0):
-        center_y = (lower[1] + upper[1]) / 2.0 + side * ASIDE * width
+        center_y = (lower[1] + upper[1]) / 2.0 + side * LAMP_OFFSET * width
         center = np.array([0.0, center_y, lower[2]])
         center[2] += min(height * step, height_fraction * (upper[2] - lower[2]))
         disk = np.concatenate([[center], center + rim])
-        disk[:, 0] = ahead * (_find_foremost(corners, disk, upper[0]) + OUT * step)
+        disk[:, 0] = ahead * (
+            _find_foremost(corners, disk, upper[0]) + GLASS_OFFSET * step
+        )
         vertices.append(disk)
-    spoke = np.arange(SPOKES)
-    disk_faces = np.stack([0 * spoke, 1 + spoke, 1 + (spoke + 1) % SPOKES], axis=1)
-    faces = np.concatenate([disk_faces, (1 + SPOKES) + disk_faces])
+    spoke = np.arange(N_SPOKES)
+    disk_faces = np.stack([0 * spoke, 1 + spoke, 1 + (spoke + 1) % N_SPOKES], axis=1)
+    faces = np.concatenate([disk_faces, (1 + N_SPOKES) + disk_faces])
     return np.concatenate(vertices), faces
 
 
-def _find_foremost(corners: Doubles, disk: Doubles, otherwise: float) -> float:
+def _find_foremost(
+    corners: Float64Array, disk: Float64Array, otherwise: float
+) -> float:
     """Return the largest x of triangles (F, 3, 3) where a disk (V, 3) covers them."""
     is_apart = (corners.min(axis=1) > disk.max(axis=0)) | (
         corners.max(axis=1) < disk.min(axis=0)
     )
     near = corners[~is_apart[:, 1:].any(axis=1)][:, :, [1, 2, 0]]
-    heights = [x for point in disk[:, 1:] for x in heights_over(near, point)]
+    heights = [x for point in disk[:, 1:] for x in find_triangle_heights(near, point)]
     return max(heights, default=otherwise)

@@ -21,24 +21,24 @@ import numpy as np
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.files import MESHES, either
 from advsearch.scene.assets import (
-    Bools,
+    BoolArray,
     EnvironmentAsset,
-    Floats,
+    Float32Array,
     Material,
     Mesh,
     ObjectAsset,
 )
-from advsearch.scene.importing.files import Notes, read_bytes, safe_name
-from advsearch.scene.importing.hdr import Plane, linear, read_exr, read_radiance
-from advsearch.scene.importing.pictures import area_average, banded_average
+from advsearch.scene.importing.files import Notes, make_safe_name, read_bytes
+from advsearch.scene.importing.hdr import Plane, decode_rgbe, read_exr, read_radiance
+from advsearch.scene.importing.pictures import average_area, average_in_bands
 from advsearch.scene.importing.ply import read_elements
 from advsearch.scene.parts import BASE_COLOR
-from advsearch.scene.raster import rasterised
+from advsearch.scene.raster import rasterize_charts
 
-SIDE = 256  # texels along the maps of roughness, metal and clear coat
+MATERIAL_MAP_SIDE = 256  # texels along the maps of roughness, metal and clear coat
 
 
-def finished(
+def make_finished_surface(
     mesh: Mesh, finishes: Mapping[str, Material], main: Material
 ) -> dict[str, object]:
     """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it.
@@ -55,7 +55,9 @@ def finished(
             finish.metallic,
             finish.clearcoat,
         )
-    texel_values = face_values[rasterised(mesh, SIDE).face].astype(np.float32)
+    texel_values = face_values[rasterize_charts(mesh, MATERIAL_MAP_SIDE).face].astype(
+        np.float32
+    )
     surface: dict[str, object] = {
         "type": "principled",
         "base_color": {"type": BASE_COLOR, "filter_type": "bilinear"},
@@ -146,7 +148,9 @@ def load_object(name: str) -> ObjectAsset:
             material=material,
             label=facts["label"],
             source=BUNDLED_OBJECT,
-            surface=finished(mesh, finishes, material) if finishes else None,
+            surface=make_finished_surface(mesh, finishes, material)
+            if finishes
+            else None,
             finishes=finishes,
             metres=facts["metres"],
             drives=facts.get("drives", False),
@@ -199,9 +203,9 @@ def make_person(defaults: Mapping[str, float] = MappingProxyType({})) -> Person:
     See the control `body`.
     """
     # torch takes seconds, and most objects have no body
-    from advsearch.scene.people import Person, body_data
+    from advsearch.scene.people import Person, load_body
 
-    return Person(body_data(), defaults)
+    return Person(load_body(), defaults)
 
 
 def load_environment(name: str) -> EnvironmentAsset:
@@ -219,9 +223,9 @@ def load_environment(name: str) -> EnvironmentAsset:
         content = (
             _data_directory() / "environments" / f"{facts.get('map', name)}.exr"
         ).read_bytes()
-        radiance: Floats = np.stack(read_exr(Path(name), content)[0], axis=2).astype(
-            np.float32
-        )
+        radiance: Float32Array = np.stack(
+            read_exr(Path(name), content)[0], axis=2
+        ).astype(np.float32)
     except (OSError, FileFormatError) as error:
         raise FileFormatError(
             f"bundled environment {name!r} cannot be read ({error}); "
@@ -237,45 +241,45 @@ def load_environment(name: str) -> EnvironmentAsset:
 # ---- Environments from pictures: ``--environment path.hdr|.exr``, equirectangular maps
 # in linear radiance -----------
 
-SUFFIXES = (".hdr", ".exr")  # the pictures that can be imported
+ENVIRONMENT_SUFFIXES = (".hdr", ".exr")  # the pictures that can be imported
 # rows and columns of the largest environment kept; larger ones are averaged down
-LARGEST = (512, 1024)
+MAX_MAP_SIZE = (512, 1024)
 # rows and columns that a smaller one is brought up to by repeating its texels;
 # renderers need a few
-SMALLEST = (4, 8)
+MIN_MAP_SIZE = (4, 8)
 
 
 @dataclass(frozen=True, eq=False)
-class LightPicture:
+class LightImage:
     """An image in linear radiance.
 
     Attributes:
         size: rows and columns.
-        band: returns the rows from its first argument to before its second, (n, W,
+        read_rows: returns the rows from its first argument to before its second, (n, W,
             3) float32.
         notes: clauses about what is left out.
     """
 
     size: tuple[int, int]
-    band: Callable[[int, int], Floats]
+    read_rows: Callable[[int, int], Float32Array]
     notes: tuple[str, ...]
 
 
-def read_light(path: Path, what: str = "environment") -> LightPicture:
+def read_light(path: Path, label: str = "environment") -> LightImage:
     """Read an ``.hdr`` or ``.exr`` image of any shape.
 
     Errors are those of `import_environment`.
     """
-    data = read_bytes(path, what, SUFFIXES)
+    data = read_bytes(path, label, ENVIRONMENT_SUFFIXES)
     if path.suffix.lower() == ".hdr":
         pixels, scale, notes = read_radiance(path, data)
-        return LightPicture(
+        return LightImage(
             pixels.shape[:2],
-            lambda top, end: linear(pixels[top:end]) * scale,
+            lambda top, end: decode_rgbe(pixels[top:end]) * scale,
             tuple(notes),
         )
     planes, notes = read_exr(path, data)
-    kinds: tuple[tuple[str, Callable[[Plane], Bools], str], ...] = (
+    kinds: tuple[tuple[str, Callable[[Plane], BoolArray], str], ...] = (
         ("NaN", np.isnan, "paint them over"),
         (
             "infinite",
@@ -295,10 +299,10 @@ def read_light(path: Path, what: str = "environment") -> LightPicture:
                 f" {kind} (the first in row {row}, column {column}: {value}); {remedy}"
             )
 
-    def stacked(top: int, end: int) -> Floats:
+    def stacked(top: int, end: int) -> Float32Array:
         return np.stack([plane[top:end] for plane in planes], axis=2).astype(np.float32)
 
-    return LightPicture(planes[0].shape, stacked, tuple(notes))
+    return LightImage(planes[0].shape, stacked, tuple(notes))
 
 
 def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
@@ -310,7 +314,7 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     A Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or Y alone
     (grey), in half or float; see `advsearch.scene.importing.hdr`.
 
-    Maps larger than `LARGEST` are averaged down, each texel weighted by the solid angle
+    Maps larger than `MAX_MAP_SIZE` are averaged down, each texel weighted by the solid angle
     that it covers, so that the light from each direction stays the same in the mean.
     Row 0 is up; columns stay in the file's order. Raises FileFormatError: the file is
     missing, of another kind, damaged, or lacks channels; the message names it. Raises
@@ -326,13 +330,13 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
             f"{file.name}: expected a map twice as wide as high, got {width} "
             f"x {height}; it appears stretched"
         )
-    radiance = _resize_map(picture.band, picture.size)
+    radiance = _resize_map(picture.read_rows, picture.size)
     if not radiance.any():
         notes.append(
             f"{file.name}: the environment is black everywhere; it lights nothing"
         )
     return EnvironmentAsset(
-        safe_name(file),
+        make_safe_name(file),
         radiance,
         source=str(file),
         warnings=tuple(notes),
@@ -340,13 +344,15 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     )
 
 
-def _resize_map(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
-    """Average a map down to at most `LARGEST`, or repeat texels up to `SMALLEST`.
+def _resize_map(
+    band: Callable[[int, int], Float32Array], size: tuple[int, int]
+) -> Float32Array:
+    """Average a map down to at most `MAX_MAP_SIZE`, or repeat texels up to `MIN_MAP_SIZE`.
 
-    See `LightPicture`.
+    See `LightImage`.
     """
     height, width = size
-    scale = min(1.0, LARGEST[0] / height, LARGEST[1] / width)
+    scale = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
     if scale == 1.0:
         texels = band(0, height)
     else:
@@ -355,16 +361,16 @@ def _resize_map(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Fl
             np.pi / height
         )
         angle = np.sin(polar)[:, None, None]
-        covered = area_average(angle, target[0], 1)
+        covered = average_area(angle, target[0], 1)
         texels = (
-            banded_average(
+            average_in_bands(
                 lambda top, end: band(top, end) * angle[top:end], size, target
             )
             / covered
         )
     repeat_rows, repeat_columns = (
         -(-smallest // extent)
-        for smallest, extent in zip(SMALLEST, texels.shape[:2], strict=True)
+        for smallest, extent in zip(MIN_MAP_SIZE, texels.shape[:2], strict=True)
     )
     return np.asarray(
         texels.repeat(repeat_rows, axis=0).repeat(repeat_columns, axis=1),

@@ -15,30 +15,30 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from advsearch.scene.assets import Bools, Doubles
+from advsearch.scene.assets import BoolArray, Float64Array
 from advsearch.scene.camera_model import EQUIRECTANGULAR
-from advsearch.scene.geometry import camera_to_world, projected
-from advsearch.scene.raster import pixels_in
+from advsearch.scene.geometry import camera_to_world, project_points
+from advsearch.scene.raster import rasterize_triangles
 from advsearch.scene.renderer import Renderer
 
 # largest width of an outline in cells; in a larger one a cell is several pixels wide
-RASTER = 2048
+MAX_OUTLINE_SIZE = 2048
 # fraction of the visible pixels that have to be in an outline, within one cell, or it
 # is not trusted
-WITHIN = 0.98
+MIN_MATCHING_FRACTION = 0.98
 
 
 @dataclass(frozen=True, eq=False)
-class SeenThing:
+class VisibleMesh:
     """What an image shows of one mesh."""
 
     name: str
-    mask: Bools  # (H, W) the pixels in which it is seen first
+    mask: BoolArray  # (H, W) the pixels in which it is seen first
     # fraction of its outline that these are, in (0, 1]; None where the outline is not
     # known
-    share: float | None
+    visible_fraction: float | None
     # whether the outline goes on beyond the image; None where it is not known
-    truncated: bool | None
+    is_truncated: bool | None
     # along the ray to its nearest visible point, in metres; object sizes where its size
     # is not known
     distance: float
@@ -54,14 +54,14 @@ class SeenThing:
         return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
-def seen_things(
+def find_visible_meshes(
     renderer: Renderer, u: Tensor, names: Collection[str] | None = None
-) -> list[SeenThing]:
+) -> list[VisibleMesh]:
     """Return the meshes that the image of a configuration (d,) shows.
 
     With `names` only those are considered.
     """
-    description = renderer.scene.made[0]
+    description = renderer.scene.definition[0]
     surfaces = renderer.surfaces(u)
     with torch.no_grad():
         inputs = renderer.scene.assembly(renderer.space.inputs(u))
@@ -69,16 +69,16 @@ def seen_things(
     for name in description.meshes if names is None else names:
         if name not in surfaces.names:
             continue
-        mask = surfaces.seen(name).numpy()
+        mask = surfaces.visible_mask(name).numpy()
         if mask.any():
             fraction, truncated = _compare_outline(renderer, inputs, name, mask)
             distance = float(surfaces.depth.numpy()[mask].min())
-            visible.append(SeenThing(name, mask, fraction, truncated, distance))
+            visible.append(VisibleMesh(name, mask, fraction, truncated, distance))
     return visible
 
 
 def _compare_outline(
-    renderer: Renderer, inputs: Mapping[str, Tensor], name: str, mask: Bools
+    renderer: Renderer, inputs: Mapping[str, Tensor], name: str, mask: BoolArray
 ) -> tuple[float | None, bool | None]:
     """Compare the visible pixels of a mesh with its outline.
 
@@ -112,16 +112,16 @@ def _project_faces(
     inputs: Mapping[str, Tensor],
     name: str,
     size: tuple[int, int],
-) -> Doubles | None:
+) -> Float64Array | None:
     """Project the corners of a mesh's faces to pixels (F, 3, 2) from the top left.
 
     None where the mesh is no outline: of a cut-out, at the seam of a panorama, or where
     it reaches behind the camera.
     """
     height, width = size
-    description = renderer.scene.made[0]
+    description = renderer.scene.definition[0]
     part = description.meshes[name]
-    vertices = renderer.scene.assembly.vertices(name, inputs)
+    vertices = renderer.scene.assembly.get_vertices(name, inputs)
     default_camera = torch.from_numpy(camera_to_world(description, width / height))
     camera = inputs.get("camera.to_world", default_camera).detach().double().cpu()
     points = (vertices.detach().double().cpu() - camera[:3, 3]) @ camera[:3, :3]
@@ -130,13 +130,16 @@ def _project_faces(
         for key, value in inputs.items()
         if key.startswith("camera.")
     }
-    positions, is_before = projected(description, camera_inputs, points, size)
+    positions, is_before = project_points(description, camera_inputs, points, size)
     model = description.camera_model
     has_seam = model is not None and model.kind == EQUIRECTANGULAR
     faces = torch.from_numpy(part.mesh.faces.astype(np.int64))
     if part.opacity is not None or has_seam or not bool(is_before[faces].all()):
         return None
-    corners: Doubles = positions.numpy()[faces.numpy()] + (width / 2.0, height / 2.0)
+    corners: Float64Array = positions.numpy()[faces.numpy()] + (
+        width / 2.0,
+        height / 2.0,
+    )
     return corners
 
 
@@ -144,12 +147,12 @@ def _project_faces(
 class _Outline:
     """A rasterised outline, in cells of one or more pixels."""
 
-    cells: Bools  # (rows, columns)
+    cells: BoolArray  # (rows, columns)
     left: float  # of the first cell, pixels from the image's top left
     top: float
     step: int  # width of a cell in pixels
 
-    def covers(self, mask: Bools) -> bool:
+    def covers(self, mask: BoolArray) -> bool:
         """Return whether visible pixels lie in the outline, or next to it."""
         n_rows, n_columns = self.cells.shape
         pixel_row, pixel_column = np.nonzero(mask)
@@ -158,16 +161,18 @@ class _Outline:
         inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
         near = ndimage.binary_dilation(self.cells, np.ones((3, 3)))
         clipped = row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
-        return bool((inside & near[clipped]).mean() >= WITHIN)
+        return bool((inside & near[clipped]).mean() >= MIN_MATCHING_FRACTION)
 
 
-def _rasterise_outline(corners: Doubles) -> _Outline:
+def _rasterise_outline(corners: Float64Array) -> _Outline:
     """Rasterise the outline of faces with corners (F, 3, 2) in pixels."""
     lower = np.floor(corners.min(axis=(0, 1)))
     upper = np.ceil(corners.max(axis=(0, 1)))
-    step = max(1, math.ceil(float((upper - lower).max()) / RASTER))
+    step = max(1, math.ceil(float((upper - lower).max()) / MAX_OUTLINE_SIZE))
     n_columns, n_rows = map(int, (upper - lower) // step + 1)
-    _, row, column, _ = pixels_in((corners - lower) / step - 0.5, (n_rows, n_columns))
+    _, row, column, _ = rasterize_triangles(
+        (corners - lower) / step - 0.5, (n_rows, n_columns)
+    )
     cells = np.zeros((n_rows, n_columns), np.bool_)
     cells[row, column] = True
     return _Outline(cells, left=lower[0], top=lower[1], step=step)

@@ -17,13 +17,13 @@ from typing import ClassVar
 import numpy as np
 
 from advsearch.scene.assets import (
-    Doubles,
-    Floats,
-    Ints,
+    Float32Array,
+    Float64Array,
+    IntArray,
     Material,
     Mesh,
     Shape,
-    pose_of,
+    make_pose,
 )
 from advsearch.scene.footprint import Footprint as Footprint
 from advsearch.scene.footprint import Solid as Solid
@@ -34,12 +34,12 @@ Triple = tuple[float, float, float]
 BASE_COLOR = "base color"
 
 
-def plugins_in(plugin: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
+def iterate_plugins(plugin: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
     """Yield a plugin's dictionary and all within it."""
     yield plugin
     for inner in plugin.values():
         if isinstance(inner, Mapping):
-            yield from plugins_in(inner)
+            yield from iterate_plugins(inner)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +62,16 @@ class MeshPart(Shape, ScenePart):
     `advsearch.scene.assembly`.
     """
 
-    to_world: Doubles = field(default_factory=lambda: np.eye(4))  # (4, 4) its base pose
+    to_world: Float64Array = field(
+        default_factory=lambda: np.eye(4)
+    )  # (4, 4) its base pose
     place: Place | None = None  # which it belongs to, and goes with
     is_ground: bool = False  # of a place: things stand on it
     # of a place: what nothing else can be in, in object sizes
     solids: tuple[Solid, ...] = ()
 
     @property
-    def laid(self) -> bool:
+    def is_laid_ground(self) -> bool:
         """Whether it belongs to the ground that the scene has by itself."""
         return self.place is not None
 
@@ -93,12 +95,12 @@ class LampGlass(MeshPart):
     """
 
     carrier: str = ""
-    follows: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    lies_on: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    vertex_of_carrier: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    face_of_carrier: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
-def mesh_part(
-    name: str, shape: Shape, to_world: Doubles, material: Material
+def make_mesh_part(
+    name: str, shape: Shape, to_world: Float64Array, material: Material
 ) -> MeshPart:
     """Return a shape with another name and material under a pose (4, 4)."""
     looks = {look.name: getattr(shape, look.name) for look in fields(Shape)}
@@ -114,12 +116,14 @@ class _Point(ScenePart):
     # base value, linear radiant intensity for each colour channel
     intensity: Triple = (0.0, 0.0, 0.0)
 
-    def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
+    def compute_lighting(
+        self, position: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
         """Return the vector (3,) from a position to the lamp, and its irradiance (3,).
 
         The irradiance is that of a surface that faces the lamp. By base values.
         """
-        to_lamp = np.array(self.position) - place
+        to_lamp = np.array(self.position) - position
         return to_lamp, np.array(self.intensity) / max(float(to_lamp @ to_lamp), 1e-12)
 
 
@@ -132,9 +136,11 @@ class PointLamp(_Point):
     """
 
 
-WIDEST = 89.9  # angles of a spot's edge, degrees
-NARROWEST = 0.1
-SOFTEST = 0.99  # largest share of that angle at which the light begins to fall off
+MAX_SPOT_ANGLE = 89.9  # angles of a spot's edge, degrees
+MIN_SPOT_ANGLE = 0.1
+MAX_BEAM_FRACTION = (
+    0.99  # largest share of that angle at which the light begins to fall off
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,21 +155,21 @@ class SpotLamp(_Point):
 
     # unit vector along its axis; z down where that is 0
     direction: Triple = (0.0, 0.0, -1.0)
-    # angle from the axis beyond which it is dark, degrees; taken to `NARROWEST` to
-    # `WIDEST`
+    # angle from the axis beyond which it is dark, degrees; taken to `MIN_SPOT_ANGLE` to
+    # `MAX_SPOT_ANGLE`
     cutoff: float = 45.0
-    # angle up to which it shines fully, degrees; taken to at most `SOFTEST` of the
+    # angle up to which it shines fully, degrees; taken to at most `MAX_BEAM_FRACTION` of the
     # other one
     beam: float = 0.0
 
     @property
     def cone(self) -> tuple[float, float]:
         """Cutoff and beam in degrees, as far as Mitsuba can have them."""
-        cutoff = min(max(self.cutoff, NARROWEST), WIDEST)
-        return cutoff, min(self.beam, SOFTEST * cutoff)
+        cutoff = min(max(self.cutoff, MIN_SPOT_ANGLE), MAX_SPOT_ANGLE)
+        return cutoff, min(self.beam, MAX_BEAM_FRACTION * cutoff)
 
     @property
-    def to_world(self) -> Doubles:
+    def to_world(self) -> Float64Array:
         """(4, 4) pose of the lamp, which shines along its own +z."""
         ahead = (
             np.array(self.direction)
@@ -172,13 +178,15 @@ class SpotLamp(_Point):
         )
         aside = np.cross(np.eye(3)[np.abs(ahead).argmin()], ahead)
         aside /= np.linalg.norm(aside)
-        return pose_of(
+        return make_pose(
             np.stack([aside, np.cross(ahead, aside), ahead], axis=1), self.position
         )
 
-    def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
+    def compute_lighting(
+        self, position: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
         """Return the vector (3,) from a position to the lamp, and its irradiance (3,)."""
-        to_lamp, irradiance = super().lighting(place)
+        to_lamp, irradiance = super().compute_lighting(position)
         cutoff, beam = self.cone
         distance = max(float(np.linalg.norm(to_lamp)), 1e-12)
         cosine = -to_lamp @ self.to_world[:3, 2] / distance
@@ -203,11 +211,13 @@ class BallLamp(ScenePart):
     """
 
     dark: bool = False  # its radiance stays 0
-    place: Triple = (0.0, 0.0, 2.0)  # base value of the ball's middle, object sizes
+    center: Triple = (0.0, 0.0, 2.0)  # base value of the ball's middle, object sizes
     radius: float = 0.1  # base value, object sizes
     radiance: Triple = (0.0, 0.0, 0.0)  # base value, linear, for each colour channel
 
-    def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
+    def compute_lighting(
+        self, position: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
         """Return the vector (3,) from a position to the lamp, and its irradiance (3,).
 
         The irradiance of a uniform ball is `pi L r^2 / d^2` (see the `light` control).
@@ -216,8 +226,8 @@ class BallLamp(ScenePart):
             math.pi * self.radius**2 * channel for channel in self.radiance
         )
         return PointLamp(
-            self.name, position=self.place, intensity=(red, green, blue)
-        ).lighting(place)
+            self.name, position=self.center, intensity=(red, green, blue)
+        ).compute_lighting(position)
 
 
 CAMERA = "camera"  # what carries the lamps of the car that the camera is in
@@ -234,19 +244,21 @@ class BeamLamp(ScenePart):
     carrier: str  # the mesh that carries it, or `CAMERA`
     # (4, 4) its pose in what carries it (`geometry.seated`): it shines along its +z and
     # has +y up
-    seat: Doubles
+    seat: Float64Array
     # (h, w) intensities on a plane before it, row 0 on top, as far as tangents of 1 to
     # either side
-    table: Floats
+    table: Float32Array
     tint: Triple  # radiant intensity for each colour channel where the table has 1
     # how often its light is sampled, where that of the environment has 1
     weight: float = 1.0
-    to_world: Doubles = field(default_factory=lambda: np.eye(4))
+    to_world: Float64Array = field(default_factory=lambda: np.eye(4))
     dark: ClassVar[bool] = False
 
-    def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
+    def compute_lighting(
+        self, position: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
         """Return the vector (3,) from a position to the lamp, and its irradiance (3,)."""
-        to_lamp = self.to_world[:3, 3] - place
+        to_lamp = self.to_world[:3, 3] - position
         aside, up, ahead = -to_lamp @ self.to_world[:3, :3]
         height, width = self.table.shape
         column = math.floor((aside / max(ahead, 1e-9) + 1.0) / 2.0 * width)
@@ -260,7 +272,7 @@ class BeamLamp(ScenePart):
 
 Lamp = PointLamp | SpotLamp | BallLamp | BeamLamp
 # what the name of an input ends in that is the picture of a projector
-PATTERN = ".pattern"
+PATTERN_SUFFIX = ".pattern"
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,18 +299,18 @@ class ProjectorPart(ScenePart):
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedCamera:
+class PosedCamera:
     """A camera with a pose of its own."""
 
     # (4, 4) its pose: it looks along its own +z with +y up and +x to the left
-    to_world: Doubles
+    to_world: Float64Array
     # field of view along the larger side of the picture, or if `upright` along its
     # height, degrees
     fov: float
     # whether it is the height that it is along, whatever the picture's shape
     upright: bool = False
 
-    def larger_fov(self, aspect: float) -> float:
+    def compute_larger_fov(self, aspect: float) -> float:
         """Return the field of view, degrees, along the larger side of an image.
 
         `aspect` is its width over its height.
@@ -354,7 +366,7 @@ class PluginPart(ScenePart):
 
     # transforms are (4, 4) arrays, pictures (H, W, C) ones
     plugin: Mapping[str, object] = field(default_factory=dict)
-    shines: bool = False  # it sends out light
+    emits_light: bool = False  # it sends out light
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,7 +377,7 @@ class MediumPart(PluginPart):
 
 
 @lru_cache(maxsize=8)
-def polygon(corners: int) -> Mesh:
+def make_polygon(corners: int) -> Mesh:
     """Return a regular polygon of radius 1 in the plane z = 0 that faces +z.
 
     Its middle, then its corners.
@@ -381,7 +393,7 @@ def polygon(corners: int) -> Mesh:
     return Mesh(vertices, faces, normals, vertices[:, :2] / 2.0 + np.float32(0.5))
 
 
-def sphere(rows: int, columns: int) -> Mesh:
+def make_sphere(rows: int, columns: int) -> Mesh:
     """Return a sphere of diameter 1 around the origin.
 
     `rows` bands from pole to pole, 2 (rows - 1) columns faces.

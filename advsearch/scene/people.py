@@ -34,18 +34,18 @@ from advsearch.options import Value
 from advsearch.scene.settings import Parameter
 
 AGES = (10.0, 25.0, 90.0)  # years of MakeHuman's child, young and old
-_of_body = partial(Parameter.moving, Parameter.GEOMETRIC)
+_body_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
 
 
-def _angle(name: str, low: float, high: float, text: str) -> Parameter:
-    return _of_body(name, "degrees", low, high, 0.0, text)
+def _joint_parameter(name: str, low: float, high: float, text: str) -> Parameter:
+    return _body_parameter(name, "degrees", low, high, 0.0, text)
 
 
 PHENOTYPE = (
-    _of_body(
+    _body_parameter(
         "height", "metres", 1.0, 2.1, 1.7, "Height without shoes and hair.", (1.5, 1.95)
     ),
-    _of_body(
+    _body_parameter(
         "weight",
         "1",
         0.0,
@@ -54,7 +54,7 @@ PHENOTYPE = (
         "0 is thin, 0.5 average, 1 heavy; `body.mass` says kilograms.",
         (0.2, 0.8),
     ),
-    _of_body(
+    _body_parameter(
         "age",
         "years",
         10.0,
@@ -63,7 +63,7 @@ PHENOTYPE = (
         "Age; children are smaller by `height` only.",
         (18.0, 75.0),
     ),
-    _of_body(
+    _body_parameter(
         "gender",
         "1",
         0.0,
@@ -74,18 +74,18 @@ PHENOTYPE = (
     ),
 )
 WALK = (
-    _of_body("walk", "degrees", -3600.0, 3600.0, 0.0, "Phase of a walk: the left heel "
+    _body_parameter("walk", "degrees", -3600.0, 3600.0, 0.0, "Phase of a walk: the left heel "
                                                       "strikes at 0, the right at 180.",
              (0.0, 360.0), periodic=True),
-    _of_body("stride", "1", 0.0, 1.3, 0.0, "How far the walk swings: 0 stands, 1 is an "
+    _body_parameter("stride", "1", 0.0, 1.3, 0.0, "How far the walk swings: 0 stands, 1 is an "
                                            "ordinary step.", (0.0, 1.0)),
 )  # fmt: skip
 SPINE = (
-    _angle("spine", -20.0, 60.0, "Bend of the back, ahead."),
-    _angle("spine_side", -25.0, 25.0, "Bend of the back to the left."),
-    _angle("spine_turn", -35.0, 35.0, "Turn of the chest to the left."),
-    _angle("neck", -45.0, 45.0, "Nod of the head, ahead."),
-    _angle("neck_turn", -70.0, 70.0, "Turn of the head to the left."),
+    _joint_parameter("spine", -20.0, 60.0, "Bend of the back, ahead."),
+    _joint_parameter("spine_side", -25.0, 25.0, "Bend of the back to the left."),
+    _joint_parameter("spine_turn", -35.0, 35.0, "Turn of the chest to the left."),
+    _joint_parameter("neck", -45.0, 45.0, "Nod of the head, ahead."),
+    _joint_parameter("neck_turn", -70.0, 70.0, "Turn of the head to the left."),
 )
 LIMBS = (
     ("shoulder", -50.0, 170.0, "arm, raised ahead"),
@@ -99,7 +99,7 @@ LIMBS = (
 )
 """Joints on both sides, with their limits in degrees."""
 _JOINTS = tuple(
-    _angle(f"{side}_{name}", low, high, f"{side.capitalize()} {text}.")
+    _joint_parameter(f"{side}_{name}", low, high, f"{side.capitalize()} {text}.")
     for side in ("left", "right")
     for name, low, high, text in LIMBS
 )
@@ -169,18 +169,20 @@ class Person:
         is_left = data["mean"][shoe_points, 1] > 0
         self._tensors["shoe_l"] = torch.from_numpy(shoe_points[is_left])
         self._tensors["shoe_r"] = torch.from_numpy(shoe_points[~is_left])
-        self.standing = self.posed({})
-        self.size = float((self.standing.amax(dim=0) - self.standing.amin(dim=0)).max())
+        self.standing_points = self.pose({})
+        self.size = float(
+            (self.standing_points.amax(dim=0) - self.standing_points.amin(dim=0)).max()
+        )
 
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
         """Return how far vertices move from the standing person, (V, 3) in its size.
 
         Arguments are those of `posed`; there are no clips.
         """
-        posed = self.posed(values)
-        return (posed - self.standing.to(posed.device)) / self.size
+        posed = self.pose(values)
+        return (posed - self.standing_points.to(posed.device)) / self.size
 
-    def posed(self, values: Mapping[str, Tensor]) -> Tensor:
+    def pose(self, values: Mapping[str, Tensor]) -> Tensor:
         """Return the vertices (V, 3) in metres.
 
         The pelvis is above the origin, and the lowest vertex on z = 0.
@@ -189,29 +191,31 @@ class Person:
             values: scalar tensors by the names of `PARAMETERS`; this person's default
                 if one is missing.
         """
-        number = self._numbers(values)
+        number = self._complete_values(values)
         device = number["height"].device
-        mixture, scale = self._phenotype(number)
+        mixture, scale = self._mix_phenotype(number)
         coefficients = torch.einsum(
-            "gawh,gawhr->r", mixture, self._on("shares", device)
+            "gawh,gawhr->r", mixture, self._get_tensor("shares", device)
         )
-        points = self._on("mean", device) + torch.einsum(
-            "r,rpc->pc", coefficients, self._on("basis", device)
+        points = self._get_tensor("mean", device) + torch.einsum(
+            "r,rpc->pc", coefficients, self._get_tensor("basis", device)
         )
         # The joints are the last points.
         joints = points[-len(self._bones) :]
         points = points[: -len(self._bones)]
-        turns, shifts = self._skeleton(joints, walked(number))
-        weights = self._on("weights", device)
-        posed = skinned(points, weights, turns, shifts)
+        turns, shifts = self._pose_bones(joints, add_walk(number))
+        weights = self._get_tensor("weights", device)
+        posed = skin_points(points, weights, turns, shifts)
         if bool(number["stride"] > 0.0):
-            raised = self._leg_corrections(points, joints, number)
-            posed = self._with_legs_corrected(posed, turns, shifts, joints, raised)
+            raised = self._compute_leg_corrections(points, joints, number)
+            posed = self._correct_legs(posed, turns, shifts, joints, raised)
         pelvis = shifts[0] + turns[0] @ joints[0]
         floor = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
-        return (scale * (posed - floor)).index_select(0, self._on("index", device))
+        return (scale * (posed - floor)).index_select(
+            0, self._get_tensor("index", device)
+        )
 
-    def _leg_corrections(
+    def _compute_leg_corrections(
         self, points: Tensor, joints: Tensor, number: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return how much each foot has to rise, "l" and "r", to touch the ground.
@@ -220,16 +224,16 @@ class Person:
         """
         zero = torch.zeros_like(number["walk"])
         without_joints = {parameter.name: zero for parameter in (*SPINE, *_JOINTS)}
-        angles = walked({**number, **without_joints})
-        turns, shifts = self._skeleton(joints, angles)
-        weights = self._on("weights", points.device)
+        angles = add_walk({**number, **without_joints})
+        turns, shifts = self._pose_bones(joints, angles)
+        weights = self._get_tensor("weights", points.device)
         lowest = dict[str, Tensor]()
         contact = dict[str, Tensor]()
         for side, phase_shift in (("l", 0.0), ("r", 180.0)):
-            shoe = self._on(f"shoe_{side}", points.device)
-            shoe_points = skinned(points[shoe], weights[shoe], turns, shifts)
+            shoe = self._get_tensor(f"shoe_{side}", points.device)
+            shoe_points = skin_points(points[shoe], weights[shoe], turns, shifts)
             lowest[side] = shoe_points[:, 2].amin()
-            contact[side] = contact_of(number["walk"] + phase_shift)
+            contact[side] = compute_contact(number["walk"] + phase_shift)
         ground = (contact["l"] * lowest["l"] + contact["r"] * lowest["r"]) / (
             contact["l"] + contact["r"]
         )
@@ -240,7 +244,7 @@ class Person:
             raised[side] = amount * (ground + clearance - height)
         return raised
 
-    def _with_legs_corrected(
+    def _correct_legs(
         self,
         posed: Tensor,
         turns: Tensor,
@@ -249,7 +253,7 @@ class Person:
         raised: Mapping[str, Tensor],
     ) -> Tensor:
         """Return posed points (P, 3) with feet risen, and legs stretched in proportion."""
-        weights = self._on("weights", posed.device)
+        weights = self._get_tensor("weights", posed.device)
         rise = torch.zeros_like(posed[:, 2])
         for side, foot_rise in raised.items():
             thigh, calf, foot = (
@@ -261,12 +265,14 @@ class Person:
             below_hip = (
                 (hip_height - posed[:, 2]) / (hip_height - ankle_height)
             ).clamp(0.0, 1.0)
-            foot_weight = sum(weights[:, index] for index in self._foot_bones(foot))
+            foot_weight = sum(
+                weights[:, index] for index in self._find_foot_bones(foot)
+            )
             leg_weight = (weights[:, thigh] + weights[:, calf]) * below_hip
             rise = rise + foot_rise * (foot_weight + leg_weight)
         return torch.cat([posed[:, :2], (posed[:, 2] + rise)[:, None]], dim=1)
 
-    def _foot_bones(self, foot: int) -> list[int]:
+    def _find_foot_bones(self, foot: int) -> list[int]:
         """Return the bone of a foot and its children."""
         return [
             foot,
@@ -277,11 +283,11 @@ class Person:
         self, values: Mapping[str, Tensor], clip: str | None = None
     ) -> Mapping[str, Value]:
         """Return the mass of the person."""
-        mixture, scale = self._phenotype(self._numbers(values))
-        mass = (mixture * self._on("mass", mixture.device)).sum() * scale**3
+        mixture, scale = self._mix_phenotype(self._complete_values(values))
+        mass = (mixture * self._get_tensor("mass", mixture.device)).sum() * scale**3
         return {"mass": {"value": float(mass), "unit": "kg"}}
 
-    def _numbers(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _complete_values(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the values of all parameters, defaults included."""
         reference = next(iter(values.values()), torch.zeros(()))
         return {
@@ -289,11 +295,11 @@ class Person:
             for name, default in self.defaults.items()
         }
 
-    def _on(self, name: str, device: torch.device) -> Tensor:
+    def _get_tensor(self, name: str, device: torch.device) -> Tensor:
         """Return one of the tensors on a device."""
         return self._tensors[name].to(device)
 
-    def _phenotype(self, number: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def _mix_phenotype(self, number: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return the mixture of extreme bodies, and the scale that it still needs.
 
         Returns:
@@ -301,26 +307,30 @@ class Person:
             which sum to 1; and the factor to the requested height.
         """
         gender = torch.stack([1.0 - number["gender"], number["gender"]])
-        age = hats(number["age"], number["age"].new_tensor(AGES))
-        weight = hats(number["weight"], number["weight"].new_tensor([0.0, 0.5, 1.0]))
+        age = compute_interpolation_weights(
+            number["age"], number["age"].new_tensor(AGES)
+        )
+        weight = compute_interpolation_weights(
+            number["weight"], number["weight"].new_tensor([0.0, 0.5, 1.0])
+        )
         mixture = torch.einsum("g,a,w->gaw", gender, age, weight)
         statures = torch.einsum(
-            "gaw,gawh->h", mixture, self._on("stature", mixture.device)
+            "gaw,gawh->h", mixture, self._get_tensor("stature", mixture.device)
         )
         requested = number["height"]
         clamped = torch.minimum(torch.maximum(requested, statures[0]), statures[2])
-        height = hats(clamped, statures)
+        height = compute_interpolation_weights(clamped, statures)
         return mixture[..., None] * height, requested / (height * statures).sum()
 
-    def _skeleton(
+    def _pose_bones(
         self, joints: Tensor, angle: Mapping[str, Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Return the turn (J, 3, 3) and shift (J, 3) of each bone.
 
         A point p moves to `turn @ p + shift`.
         """
-        straight = self._straight_turns(joints)
-        joint_turns = turned(angle)
+        straight = self._compute_straight_turns(joints)
+        joint_turns = compute_joint_turns(angle)
         identity = torch.eye(3, device=joints.device, dtype=joints.dtype)
         global_turns = list[Tensor]()
         turns = list[Tensor]()
@@ -341,7 +351,7 @@ class Person:
             "jik,jk->ji", stacked, joints
         )
 
-    def _straight_turns(self, joints: Tensor) -> dict[str, Tensor]:
+    def _compute_straight_turns(self, joints: Tensor) -> dict[str, Tensor]:
         """Return the turns (3, 3) of limbs from the rest pose to all angles 0."""
         straight = dict[str, Tensor]()
         for side, sign in (("l", 1.0), ("r", -1.0)):
@@ -349,18 +359,18 @@ class Person:
                 start_point, end_point = (
                     joints[self._bones.index(f"{name}_{side}")] for name in (bone, end)
                 )
-                straight[f"{bone}_{side}"] = least_turn(
+                straight[f"{bone}_{side}"] = compute_least_rotation(
                     end_point - start_point, joints.new_tensor([x, sign * y, z])
                 )
             straight[f"hand_{side}"] = (
-                about("z", joints.new_tensor(sign * 60.0))
+                rotation_about("z", joints.new_tensor(sign * 60.0))
                 @ straight[f"lowerarm_{side}"]
             )
         return straight
 
 
 @lru_cache(maxsize=1)
-def body_data() -> Mapping[str, np.ndarray]:
+def load_body() -> Mapping[str, np.ndarray]:
     """Load the arrays of body.npz."""
     content = (
         resources.files("advsearch.bundled") / "data/objects/person/body.npz"
@@ -369,12 +379,12 @@ def body_data() -> Mapping[str, np.ndarray]:
         return dict(file)
 
 
-def hats(value: Tensor, at: Tensor) -> Tensor:
+def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
     """Return the weights (n,) of linear interpolation between rising nodes (n,).
 
     They sum to 1 from the first node to the last.
     """
-    fraction = (value - at[:-1]) / (at[1:] - at[:-1])
+    fraction = (value - nodes[:-1]) / (nodes[1:] - nodes[:-1])
     # At a node the derivative is that of one side, not the sum of both.
     is_within = (fraction >= 0.0) & (fraction < 1.0)
     fraction = torch.where(is_within, fraction, (fraction >= 1.0).to(fraction.dtype))
@@ -383,14 +393,14 @@ def hats(value: Tensor, at: Tensor) -> Tensor:
     )
 
 
-def walked(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def add_walk(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the angles with those of the walk added, within each joint's limits."""
     angle = dict(number)
     phase = torch.deg2rad(number["walk"])
     stride = number["stride"]
     for side, phase_shift in (("left", 0.0), ("right", np.pi)):
         for joint, tenths in GAIT.items():
-            swing = _gait_angle(tenths, phase, phase_shift)
+            swing = _compute_gait_angle(tenths, phase, phase_shift)
             angle[f"{side}_{joint}"] = angle[f"{side}_{joint}"] + stride * swing
     angle["spine_turn"] = angle["spine_turn"] + stride * 5.0 * torch.cos(phase)
     limits = {
@@ -404,7 +414,9 @@ def walked(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
     }
 
 
-def _gait_angle(tenths: Sequence[int], phase: Tensor, phase_shift: float) -> Tensor:
+def _compute_gait_angle(
+    tenths: Sequence[int], phase: Tensor, phase_shift: float
+) -> Tensor:
     """Return an angle of the gait at a phase, by a Fourier series of its samples."""
     waves = np.fft.rfft(tenths)[:5] / len(tenths)
     swing = phase.new_tensor(float(waves[0].real))
@@ -417,7 +429,7 @@ def _gait_angle(tenths: Sequence[int], phase: Tensor, phase_shift: float) -> Ten
     return swing
 
 
-def contact_of(phase: Tensor) -> Tensor:
+def compute_contact(phase: Tensor) -> Tensor:
     """Return how much a foot is held to the ground, 0 to 1.
 
     The phase is in degrees of the foot's cycle from its heel strike.
@@ -428,7 +440,9 @@ def contact_of(phase: Tensor) -> Tensor:
     return 0.5 + 0.5 * torch.cos(np.pi * (lifted - lowered))
 
 
-def skinned(points: Tensor, weights: Tensor, turns: Tensor, shifts: Tensor) -> Tensor:
+def skin_points(
+    points: Tensor, weights: Tensor, turns: Tensor, shifts: Tensor
+) -> Tensor:
     """Return points moved with bones: linear blend skinning.
 
     Args:
@@ -446,14 +460,20 @@ def skinned(points: Tensor, weights: Tensor, turns: Tensor, shifts: Tensor) -> T
     )
 
 
-def turned(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return each bone's turn (3, 3) against its parent, of joint angles in degrees."""
     # The back bends in three equal parts, neck and head share the nod.
     spine, side, turn = (
         angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn")
     )
-    bend = about("y", spine) @ about("x", -side) @ about("z", turn)
-    nod = about("z", angle["neck_turn"] / 2.0) @ about("y", angle["neck"] / 2.0)
+    bend = (
+        rotation_about("y", spine)
+        @ rotation_about("x", -side)
+        @ rotation_about("z", turn)
+    )
+    nod = rotation_about("z", angle["neck_turn"] / 2.0) @ rotation_about(
+        "y", angle["neck"] / 2.0
+    )
     turns = {
         "spine_01": bend,
         "spine_02": bend,
@@ -464,19 +484,21 @@ def turned(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     for side_name, sign in (("left", 1.0), ("right", -1.0)):
         limb = {joint: angle[f"{side_name}_{joint}"] for joint, *_ in LIMBS}
         suffix = side_name[0]
-        raised = about("x", sign * limb["shoulder_out"]) @ about("y", -limb["shoulder"])
-        shoulder_turn = about("z", -sign * limb["shoulder_turn"])
-        turns[f"upperarm_{suffix}"] = raised @ shoulder_turn
-        turns[f"lowerarm_{suffix}"] = about("y", -limb["elbow"])
-        turns[f"thigh_{suffix}"] = about("x", sign * limb["hip_out"]) @ about(
-            "y", -limb["hip"]
+        raised = rotation_about("x", sign * limb["shoulder_out"]) @ rotation_about(
+            "y", -limb["shoulder"]
         )
-        turns[f"calf_{suffix}"] = about("y", limb["knee"])
-        turns[f"foot_{suffix}"] = about("y", -limb["ankle"])
+        shoulder_turn = rotation_about("z", -sign * limb["shoulder_turn"])
+        turns[f"upperarm_{suffix}"] = raised @ shoulder_turn
+        turns[f"lowerarm_{suffix}"] = rotation_about("y", -limb["elbow"])
+        turns[f"thigh_{suffix}"] = rotation_about(
+            "x", sign * limb["hip_out"]
+        ) @ rotation_about("y", -limb["hip"])
+        turns[f"calf_{suffix}"] = rotation_about("y", limb["knee"])
+        turns[f"foot_{suffix}"] = rotation_about("y", -limb["ankle"])
     return turns
 
 
-def about(axis: str, degrees: Tensor) -> Tensor:
+def rotation_about(axis: str, degrees: Tensor) -> Tensor:
     """Return the right-handed rotation (3, 3) about an axis of the body."""
     c = torch.cos(torch.deg2rad(degrees))
     s = torch.sin(torch.deg2rad(degrees))
@@ -490,7 +512,7 @@ def about(axis: str, degrees: Tensor) -> Tensor:
     return torch.stack(rows[axis]).reshape(3, 3)
 
 
-def least_turn(begin: Tensor, end: Tensor) -> Tensor:
+def compute_least_rotation(begin: Tensor, end: Tensor) -> Tensor:
     """Return the smallest rotation (3, 3) from one direction to another.
 
     It is `I + V + V^2 / (1 + c)`, with V the cross product matrix of the unit vectors

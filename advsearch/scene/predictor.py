@@ -43,15 +43,15 @@ NOTHING_MOVES = Refusal(
 NOISE = Refusal("noise is part of the picture without the denoiser", RefusalCause.NOISE)
 """A refusal without other reasons: with the denoiser, the images could be predicted."""
 # fractions of a parameter's range at which its effect on the inputs is tested
-BETWEEN = (0.02, 0.29, 0.61, 0.97)
-MOST_BYTES = 2**30  # memory limit of one predictor, times `ADVSEARCH_LIMITS`
+PROBE_FRACTIONS = (0.02, 0.29, 0.61, 0.97)
+MAX_BYTES = 2**30  # memory limit of one predictor, times `ADVSEARCH_LIMITS`
 
 
 class Predictor(ABC):
     """Predict the images of a space without noise; differentiable.
 
     Args:
-        traced: a renderer of the space, which traces paths.
+        path_renderer: a renderer of the space, which traces paths.
 
     Attributes:
         non_finite: how many values were not finite while it was made, and were set to
@@ -61,25 +61,25 @@ class Predictor(ABC):
     non_finite: int = 0
 
     def __init__(self, traced: Renderer) -> None:
-        self.traced = traced
+        self.path_renderer = traced
 
     @property
     def renderer(self) -> Renderer:
         """A renderer of the same space whose images are the predicted ones."""
         # A new one each time: two objects that hold each other are freed late, and
         # matrices are large.
-        return self.traced.like(predict=self.radiance)
+        return self.path_renderer.copy_with(predict=self.predict_radiance)
 
     def __call__(self, u: Tensor) -> Tensor:
         """Return the image (H, W, 3) sRGB of a configuration (d,); differentiable."""
         return self.renderer(u)
 
-    def pictures(self, us: Sequence[Tensor]) -> Sequence[Tensor]:
+    def predict_images(self, us: Sequence[Tensor]) -> Sequence[Tensor]:
         """Return the images of several configurations."""
         return [self(u) for u in us]
 
     @abstractmethod
-    def radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
+    def predict_radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
         """Return the linear radiance of scene inputs.
 
         See `advsearch.scene.renderer.Predict`.
@@ -87,27 +87,27 @@ class Predictor(ABC):
 
     @property
     @abstractmethod
-    def entries(self) -> int:
+    def n_entries(self) -> int:
         """Number of entries of all matrices, for one color channel."""
 
     @property
     @abstractmethod
-    def bytes(self) -> int:
+    def n_bytes(self) -> int:
         """Memory of all that is stored."""
 
     @property
-    def lights(self) -> int:
+    def n_traced_images(self) -> int:
         """Number of images that were traced for it."""
         return 1
 
 
-def differs(one: Tensor | None, other: Tensor | None) -> bool:
+def inputs_differ(first: Tensor | None, second: Tensor | None) -> bool:
     """Return whether two inputs of a scene are not the same, bit for bit."""
     return (
-        one is None
-        or other is None
-        or one.shape != other.shape
-        or not torch.equal(one, other)
+        first is None
+        or second is None
+        or first.shape != second.shape
+        or not torch.equal(first, second)
     )
 
 

@@ -21,18 +21,27 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Bools, Doubles, Floats, Ints, Mesh, face_vectors
-from advsearch.scene.importing.geometry import connected
+from advsearch.scene.assets import (
+    BoolArray,
+    Float32Array,
+    Float64Array,
+    IntArray,
+    Mesh,
+    compute_area_vectors,
+)
+from advsearch.scene.importing.geometry import find_components
 
 # barycentric weight by which a pixel's center may miss a triangle, so that shared edges
 # leave no gaps
 TOLERANCE = 1e-6
-MISS = 1e-4  # pixels by which a center may miss a triangle and still be a candidate
+PIXEL_TOLERANCE = (
+    1e-4  # pixels by which a center may miss a triangle and still be a candidate
+)
 
 
-def pixels_in(
-    corners: Doubles, shape: tuple[int, int], tolerance: float = TOLERANCE
-) -> tuple[Ints, Ints, Ints, Doubles]:
+def rasterize_triangles(
+    corners: Float64Array, shape: tuple[int, int], tolerance: float = TOLERANCE
+) -> tuple[IntArray, IntArray, IntArray, Float64Array]:
     """List the pixels of a raster whose centers lie in triangles.
 
     Args:
@@ -45,46 +54,49 @@ def pixels_in(
         For each pixel of each triangle, triangle by triangle, the triangle, row and
         column (N,), and the corners' barycentric weights (N, 3).
     """
-    face, row, column = pixels_near(corners, shape, 10.0 * MISS)
-    weights = weights_at(corners[face], row, column)
+    face, row, column = find_candidate_pixels(corners, shape, 10.0 * PIXEL_TOLERANCE)
+    weights = compute_barycentric(corners[face], row, column)
     inside = (weights >= -tolerance).all(axis=1)
     return face[inside], row[inside], column[inside], weights[inside]
 
 
-def pixels_near(
-    corners: Doubles, shape: tuple[int, int], miss: float = MISS
-) -> tuple[Ints, Ints, Ints]:
+def find_candidate_pixels(
+    corners: Float64Array, shape: tuple[int, int], tolerance: float = PIXEL_TOLERANCE
+) -> tuple[IntArray, IntArray, IntArray]:
     """List the pixels whose centers lie in triangles, also flat ones, or nearly.
 
-    They may miss a triangle by `miss` pixels along their row or column. Other arguments
-    as for `pixels_in`.
+    They may miss a triangle by `tolerance` pixels along their row or column. Other arguments
+    as for `rasterize_triangles`.
 
     Returns:
         Triangle, row and column (N,).
     """
     face, row = _integers_within(
-        corners[..., 1].min(axis=1), corners[..., 1].max(axis=1), shape[0], miss
+        corners[..., 1].min(axis=1), corners[..., 1].max(axis=1), shape[0], tolerance
     )
-    left, right = _cross_rows(corners[face], row, miss)
-    span, column = _integers_within(left, right, shape[1], miss)
+    left, right = _cross_rows(corners[face], row, tolerance)
+    span, column = _integers_within(left, right, shape[1], tolerance)
     return face[span], row[span], column
 
 
-def texels_read(corners: Doubles, shape: tuple[int, int]) -> Bools:
+def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray:
     """Return the texels (h, w) that bilinear look-ups in triangles read.
 
-    Look-ups repeat at the border. The triangles (F, 3, 2) are as for `pixels_in`, at
+    Look-ups repeat at the border. The triangles (F, 3, 2) are as for `rasterize_triangles`, at
     most half a texel outside of the texture.
     """
     # A look-up between two texels is in the cell of the first; -1 is the last one
     # again.
     shifted = corners + 1.0
-    lowest_row = np.floor(shifted[..., 1].min(axis=1) - MISS)
-    highest_row = np.floor(shifted[..., 1].max(axis=1) + MISS)
+    lowest_row = np.floor(shifted[..., 1].min(axis=1) - PIXEL_TOLERANCE)
+    highest_row = np.floor(shifted[..., 1].max(axis=1) + PIXEL_TOLERANCE)
     face, row = _integers_within(lowest_row, highest_row, shape[0] + 1, 0.0)
     left, right = _span_of_rows(shifted[face], row)
     span, column = _integers_within(
-        np.floor(left - MISS), np.floor(right + MISS), shape[1] + 1, 0.0
+        np.floor(left - PIXEL_TOLERANCE),
+        np.floor(right + PIXEL_TOLERANCE),
+        shape[1] + 1,
+        0.0,
     )
     is_read = np.zeros(shape, np.bool_)
     for row_offset in (0, 1):
@@ -95,7 +107,9 @@ def texels_read(corners: Doubles, shape: tuple[int, int]) -> Bools:
     return is_read
 
 
-def _span_of_rows(corners: Doubles, row: Ints) -> tuple[Doubles, Doubles]:
+def _span_of_rows(
+    corners: Float64Array, row: IntArray
+) -> tuple[Float64Array, Float64Array]:
     """Return the columns that triangles (N, 3, 2) have between a row (N,) and the next.
 
     The first and the last column are in the triangle's corners, or where its edges
@@ -103,19 +117,19 @@ def _span_of_rows(corners: Doubles, row: Ints) -> tuple[Doubles, Doubles]:
     """
     rows = row[:, None]
     y = corners[..., 1]
-    is_between = (y >= rows - MISS) & (y <= rows + 1 + MISS)
+    is_between = (y >= rows - PIXEL_TOLERANCE) & (y <= rows + 1 + PIXEL_TOLERANCE)
     left = np.where(is_between, corners[..., 0], np.inf).min(axis=1)
     right = np.where(is_between, corners[..., 0], -np.inf).max(axis=1)
     for offset in (0, 1):
-        first, last = _cross_rows(corners, row + offset, MISS)
+        first, last = _cross_rows(corners, row + offset, PIXEL_TOLERANCE)
         left = np.where(first <= last, np.minimum(left, first), left)
         right = np.where(first <= last, np.maximum(right, last), right)
     return left, right
 
 
-def weights_at(
-    corners: Doubles, row: Ints | Doubles, column: Ints | Doubles
-) -> Doubles:
+def compute_barycentric(
+    corners: Float64Array, row: IntArray | Float64Array, column: IntArray | Float64Array
+) -> Float64Array:
     """Return the barycentric weights (N, 3) of pixel centers in triangles (N, 3, 2).
 
     They are NaN where a triangle has no area.
@@ -124,13 +138,13 @@ def weights_at(
     bx, by = corners[:, 1].T
     cx, cy = corners[:, 2].T
     with np.errstate(all="ignore"):
-        scale = 1.0 / doubled_areas(corners)
+        scale = 1.0 / compute_doubled_areas(corners)
         second = ((column - ax) * (cy - ay) - (row - ay) * (cx - ax)) * scale
         third = ((bx - ax) * (row - ay) - (by - ay) * (column - ax)) * scale
         return np.stack([1.0 - second - third, second, third], axis=-1)
 
 
-def doubled_areas(corners: Doubles) -> Doubles:
+def compute_doubled_areas(corners: Float64Array) -> Float64Array:
     """Return twice the signed area (F,) of flat triangles (F, 3, 2)."""
     a = corners[:, 1] - corners[:, 0]
     b = corners[:, 2] - corners[:, 0]
@@ -138,8 +152,8 @@ def doubled_areas(corners: Doubles) -> Doubles:
 
 
 def _integers_within(
-    lower: Doubles, upper: Doubles, size: int, miss: float
-) -> tuple[Ints, Ints]:
+    lower: Float64Array, upper: Float64Array, size: int, miss: float
+) -> tuple[IntArray, IntArray]:
     """List the integers of many intervals within [0, size - 1].
 
     The intervals are [lower, upper], wider by `miss` on each side.
@@ -156,7 +170,9 @@ def _integers_within(
     return interval, value
 
 
-def _cross_rows(corners: Doubles, row: Ints, miss: float) -> tuple[Doubles, Doubles]:
+def _cross_rows(
+    corners: Float64Array, row: IntArray, miss: float
+) -> tuple[Float64Array, Float64Array]:
     """Return the first and last column (N,) of triangles (N, 3, 2) on rows (N,).
 
     An empty range is 0 to -1.
@@ -182,7 +198,7 @@ def _cross_rows(corners: Doubles, row: Ints, miss: float) -> tuple[Doubles, Doub
 
 # texels around a chart that belong to it: a bilinear look-up inside reads one texel
 # beyond it
-BORDER = 2.0
+BORDER_TEXELS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,54 +208,62 @@ class Charts:
     mesh: Mesh
     # (h, w) of the face that each texel lies in; uncovered texels have that of the
     # nearest covered one
-    face: Ints
+    face: IntArray
     # (h, w, 3) barycentric weights of the face's three corners, at least 0, adding up
     # to 1
-    weights: Doubles
-    covered: Bools  # (h, w) the texel's center lies in a chart
-    distance: Doubles  # (h, w) texels to the nearest covered texel; 0 where covered
+    weights: Float64Array
+    is_covered: BoolArray  # (h, w) the texel's center lies in a chart
+    distance: (
+        Float64Array  # (h, w) texels to the nearest covered texel; 0 where covered
+    )
 
     @property
-    def touched(self) -> Bools:
+    def is_readable(self) -> BoolArray:
         """(h, w) whether a look-up on the surface can read the texel.
 
-        It is in a chart or `BORDER` texels around one.
+        It is in a chart or `BORDER_TEXELS` texels around one.
         """
-        return np.asarray(self.distance <= BORDER)
+        return np.asarray(self.distance <= BORDER_TEXELS)
 
-    def positions(self) -> Floats:
+    def compute_positions(self) -> Float32Array:
         """Return (h, w, 3) positions in mesh coordinates."""
         corners = self.mesh.vertices[self.mesh.faces[self.face]]
         return np.asarray(
             np.einsum("hwk,hwkc->hwc", self.weights, corners), dtype=np.float32
         )
 
-    def normals(self) -> Floats:
+    def compute_normals(self) -> Float32Array:
         """Return (h, w, 3) unit shading normals."""
         corners = self.mesh.normals[self.mesh.faces[self.face]]
         normals = np.einsum("hwk,hwkc->hwc", self.weights, corners)
         lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
         unit_normals = normals / np.maximum(lengths, 1e-6)
-        face_normals = _face_normals(self.mesh)[self.face]
+        face_normals = _compute_face_normals(self.mesh)[self.face]
         return np.where(lengths > 1e-6, unit_normals, face_normals).astype(np.float32)
 
-    def areas(self) -> Floats:
+    def compute_areas(self) -> Float32Array:
         """Return the surface area (h, w) of each texel, in squared mesh units.
 
         It is 0 where no chart is.
         """
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
-        face_areas = np.linalg.norm(face_vectors(corners), axis=1)
-        texels = np.abs(doubled_areas(_in_texels(self.mesh, self.covered.shape)))
+        face_areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
+        texels = np.abs(
+            compute_doubled_areas(
+                _to_texel_coordinates(self.mesh, self.is_covered.shape)
+            )
+        )
         area_per_texel = np.where(
             texels > 0.0, face_areas / np.maximum(texels, 1e-12), 0.0
         )
-        return np.where(self.covered, area_per_texel[self.face], 0.0).astype(np.float32)
+        return np.where(self.is_covered, area_per_texel[self.face], 0.0).astype(
+            np.float32
+        )
 
 
-def texels_of_faces(
-    mesh: Mesh, faces: Ints, shape: tuple[int, int]
-) -> tuple[Bools, float]:
+def find_exclusive_texels(
+    mesh: Mesh, faces: IntArray, shape: tuple[int, int]
+) -> tuple[BoolArray, float]:
     """Return the texels that bilinear look-ups on some faces alone read.
 
     Args:
@@ -251,14 +275,14 @@ def texels_of_faces(
         (h, w) texels that no look-up on other faces reads, and their fraction of those
         that look-ups on these faces read.
     """
-    corners = _in_texels(mesh, shape)
+    corners = _to_texel_coordinates(mesh, shape)
     is_selected = np.isin(np.arange(len(mesh.faces)), faces)
-    read = texels_read(corners[is_selected], shape)
-    exclusive = read & ~texels_read(corners[~is_selected], shape)
+    read = find_read_texels(corners[is_selected], shape)
+    exclusive = read & ~find_read_texels(corners[~is_selected], shape)
     return exclusive, float(exclusive.sum()) / max(1, int(read.sum()))
 
 
-def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
+def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     """Find the face and the barycentric weights of every texel of a texture.
 
     Where charts overlap, one of their faces wins.
@@ -271,8 +295,8 @@ def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
         InputError: the texture coordinates cover no texel.
     """
     shape = (resolution, resolution) if isinstance(resolution, int) else resolution
-    corners = _in_texels(mesh, shape)
-    face, row, column = pixels_near(corners, shape)
+    corners = _to_texel_coordinates(mesh, shape)
+    face, row, column = find_candidate_pixels(corners, shape)
     if len(face) == 0:
         raise InputError(
             f"mesh texture coordinates: none of the {shape[0]} x {shape[1]} texels "
@@ -292,9 +316,9 @@ def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     return Charts(mesh, face_map[nearest], weight_map[nearest], covered, distance)
 
 
-def _clipped_weights(corners: Doubles, points: Ints) -> Doubles:
+def _clipped_weights(corners: Float64Array, points: IntArray) -> Float64Array:
     """Return the barycentric weights (N, 3) of points, clipped to their triangles."""
-    doubled = doubled_areas(corners)
+    doubled = compute_doubled_areas(corners)
     divisor = np.where(doubled == 0.0, 1.0, doubled)
     columns = []
     for first, second in ((1, 2), (2, 0), (0, 1)):
@@ -306,9 +330,9 @@ def _clipped_weights(corners: Doubles, points: Ints) -> Doubles:
     return np.where(total > 0.0, weights / np.maximum(total, 1e-12), 1.0 / 3.0)
 
 
-def looked_up(
-    texels: Floats, x: npt.NDArray[np.floating], y: npt.NDArray[np.floating]
-) -> Floats:
+def look_up_texture(
+    texels: Float32Array, x: npt.NDArray[np.floating], y: npt.NDArray[np.floating]
+) -> Float32Array:
     """Look a repeating texture up with bilinear interpolation.
 
     Args:
@@ -338,11 +362,11 @@ class MeshSurface:
 
     def __init__(self, mesh: Mesh) -> None:
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
-        self.normals = _face_normals(mesh)
+        self.normals = _compute_face_normals(mesh)
         self._lower = self._corners.min(axis=1)
         self._upper = self._corners.max(axis=1)
         # Pairs (E, 2) of faces with an edge in common, across UV seams too.
-        corners = welded(mesh)[0][mesh.faces]
+        corners = weld_vertices(mesh)[0][mesh.faces]
         edges = np.concatenate(
             [corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]
         )
@@ -352,7 +376,9 @@ class MeshSurface:
         face = order % len(mesh.faces)
         self._neighbours = np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
 
-    def hit(self, origin: Doubles, direction: Doubles) -> tuple[int, Doubles]:
+    def find_hit(
+        self, origin: Float64Array, direction: Float64Array
+    ) -> tuple[int, Float64Array]:
         """Find the first face that a ray meets, from either side.
 
         Args:
@@ -372,7 +398,7 @@ class MeshSurface:
         face, corner = np.unravel_index(line_distance.argmin(), line_distance.shape)
         return int(face), self._corners[face, corner]
 
-    def _intersect(self, origin: Doubles, direction: Doubles) -> Doubles:
+    def _intersect(self, origin: Float64Array, direction: Float64Array) -> Float64Array:
         """Return the distance (F,) at which a ray meets each face, or infinity.
 
         Moeller and Trumbore 1997, all faces at once.
@@ -397,9 +423,9 @@ class MeshSurface:
         is_hit &= (u + v <= 1.0 + slack) & (distance > 0.0)
         return np.where(is_hit, distance, np.inf)
 
-    def region(
-        self, face: int, point: Doubles, normal: Doubles, radius: float
-    ) -> Bools:
+    def find_region(
+        self, face: int, point: Float64Array, normal: Float64Array, radius: float
+    ) -> BoolArray:
         """Return the faces (F,) around a point that are connected to a face.
 
         They lie within a radius of the point (3,), face a direction (3,), and are
@@ -411,11 +437,11 @@ class MeshSurface:
         inside = is_near & (self.normals @ normal > 0.0)
         inside[face] = True
         links = self._neighbours[inside[self._neighbours].all(axis=1)]
-        labels = connected(len(inside), *links.T)
+        labels = find_components(len(inside), *links.T)
         return np.asarray(inside & (labels == labels[face]))
 
 
-def welded(mesh: Mesh) -> tuple[Ints, int]:
+def weld_vertices(mesh: Mesh) -> tuple[IntArray, int]:
     """Return the index of the position of each vertex (V,), and how many there are.
 
     Vertices that UV seams and creases split share a position: 1e-5 of the mesh's
@@ -428,7 +454,7 @@ def welded(mesh: Mesh) -> tuple[Ints, int]:
     return index, int(index.max()) + 1
 
 
-def _in_texels(mesh: Mesh, shape: tuple[int, int]) -> Doubles:
+def _to_texel_coordinates(mesh: Mesh, shape: tuple[int, int]) -> Float64Array:
     """Return texture coordinates of the faces' corners (F, 3, 2) in texels.
 
     They are column and row, integers at texel centers. Where a texture repeats, each
@@ -442,8 +468,8 @@ def _in_texels(mesh: Mesh, shape: tuple[int, int]) -> Doubles:
     return np.stack([column, row], axis=-1)
 
 
-def _face_normals(mesh: Mesh) -> Doubles:
+def _compute_face_normals(mesh: Mesh) -> Float64Array:
     """Return the unit normals (F, 3) of a mesh's faces."""
-    vectors = face_vectors(mesh.vertices[mesh.faces].astype(np.float64))
+    vectors = compute_area_vectors(mesh.vertices[mesh.faces].astype(np.float64))
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors / np.maximum(lengths, 1e-20))

@@ -29,19 +29,19 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.pictures import png_of
-from advsearch.scene.assembly import ON_PICTURE, Motion, central
-from advsearch.scene.color import levels_of
+from advsearch.scene.assembly import IMAGE_INPUTS, Motion, write_central_differences
+from advsearch.scene.color import to_uint8
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import ImageFormation, Later, Moment, Surfaces
-from advsearch.scene.geometry import camera_to_world, middle
+from advsearch.scene.formation import ImageFormation, InputMapping, Moment, Surfaces
+from advsearch.scene.geometry import camera_to_world, compute_center
 from advsearch.scene.gradients import (
-    BY_ADJOINT,
-    BY_DIFFERENCES,
+    ADJOINT_ESTIMATORS,
+    DIFFERENCE_ESTIMATORS,
     TURN_STEP,
     Group,
-    first_order,
-    first_plan,
-    steps_for,
+    compute_steps,
+    forbid_second_derivatives,
+    make_first_plan,
 )
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
@@ -59,7 +59,7 @@ It is (H, W, 4) with coverage where there is a backdrop.
 """
 
 
-class InputSpace(Later, Protocol):
+class InputSpace(InputMapping, Protocol):
     """What the renderer and a user's own loop need of a space.
 
     It is its start, its groups, and what a configuration does.
@@ -73,7 +73,7 @@ class InputSpace(Later, Protocol):
     def groups(self) -> tuple[Group, ...]:
         """Every group of coordinates with its valid estimators."""
 
-    def later(self, seconds: float) -> Later:
+    def later(self, seconds: float) -> InputMapping:
         """Return what maps u to scene inputs some seconds later."""
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
@@ -93,9 +93,9 @@ class InputSpace(Later, Protocol):
 
 
 # largest group for which it is measured how far its coordinates move outlines
-MOST_MEASURED = 64
+MAX_MEASURED_SIZE = 64
 # fraction of the noise over which the tone curve is straight; see `Renderer.halves`
-SMALL_PART = 0.0625
+STRAIGHT_FRACTION = 0.0625
 
 
 class Renderer:
@@ -144,11 +144,11 @@ class Renderer:
         self.renders = self.gradients = self.non_finite = 0
         self._left_out: frozenset[str] = frozenset()
         groups = space.groups
-        self.plan = first_plan(
+        self.plan = make_first_plan(
             groups,
-            self._steps(groups, motion),
+            self._compute_steps(groups, motion),
             estimators,
-            across=max(formation.resolution),
+            image_size=max(formation.resolution),
         )
         self.routes = self._find_routes(groups)
 
@@ -167,20 +167,20 @@ class Renderer:
     def _repr_png_(self) -> bytes:
         """Return the start as a notebook shows it; it does not count as a render."""
         with torch.no_grad():
-            return png_of(levels_of(self.like()(self.start)).numpy())
+            return png_of(to_uint8(self.copy_with()(self.start)).numpy())
 
     @property
-    def composed(self) -> str:
+    def composition_reason(self) -> str:
         """Why an image is not that of one scene as one camera sees it.
 
         It is empty if it is, so that others may predict it from light that was
         collected once.
         """
-        if self.scene.made[0].rig:
+        if self.scene.definition[0].rig:
             return "a picture is made of those of several cameras"
         return "a picture is made of several moments" if self.moments else ""
 
-    def like(
+    def copy_with(
         self,
         scene: MitsubaScene | None = None,
         *,
@@ -231,9 +231,13 @@ class Renderer:
         if u.ndim == 2 and len(u):
             return torch.stack([self(row, seed, spp) for row in u])
         u, through = self._check_arguments(u, spp)
-        with _no_inference():
+        with _leave_inference_mode():
             image = self._render_image(through, seed, spp)
-            if through is not u and torch.is_grad_enabled() and self._differenced():
+            if (
+                through is not u
+                and torch.is_grad_enabled()
+                and self._groups_by_differences()
+            ):
                 image = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
             return image
 
@@ -244,10 +248,12 @@ class Renderer:
         configuration are in it; what controls do to the finished image is not.
         """
         _, through = self._check_arguments(u, spp)
-        with _no_inference():
+        with _leave_inference_mode():
             return self._render_image(through, seed, spp, display=False)
 
-    def halves(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
+    def render_halves(
+        self, u: Tensor, seed: int, spp: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Trace two images of a configuration with independent noise.
 
         The two are passed through a tone curve that is straight about the third, so
@@ -264,15 +270,17 @@ class Renderer:
             halves, mean = self._trace_halves(inputs, seed, spp)
 
             def finish(radiance: Tensor) -> Tensor:
-                return self.finished(radiance, inputs, u, display=False)
+                return self.finish_image(radiance, inputs, u, display=False)
 
             clean = finish(mean)
             curve_point = self.formation.display(clean)
 
             def display_straight(radiance: Tensor) -> Tensor:
                 """Extend the tone curve's tangent at the denoised image."""
-                nudged = torch.lerp(clean, finish(radiance), SMALL_PART)
-                slope = (self.formation.display(nudged) - curve_point) / SMALL_PART
+                nudged = torch.lerp(clean, finish(radiance), STRAIGHT_FRACTION)
+                slope = (
+                    self.formation.display(nudged) - curve_point
+                ) / STRAIGHT_FRACTION
                 return self.space.picture(u, curve_point + slope)
 
             first = display_straight(halves[0])
@@ -285,19 +293,19 @@ class Renderer:
         """Trace two renders with independent noise; return them and the denoised mean."""
         hide = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
-        undenoised = self.like(denoiser="none")
+        undenoised = self.copy_with(denoiser="none")
         noise_seeds = [seeds.stream(seed, "traced", half) for half in range(2)]
         halves = [
-            undenoised.rendered(scene_inputs, noise_seed, spp, hide)
+            undenoised.render_radiance(scene_inputs, noise_seed, spp, hide)
             for noise_seed in noise_seeds
         ]
         mean = (halves[0] + halves[1]) / 2.0
         guide_seed = seeds.stream(self.root_seed, "guides", noise_seeds[0])
-        albedo, normal = self.scene.guides(scene_inputs, guide_seed, spp)
+        albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
         clean = denoise(mean[..., :3].contiguous(), albedo, normal)
         return halves, torch.cat([clean, mean[..., 3:]], dim=-1)
 
-    def traced_inputs(self, u: Tensor) -> dict[str, Tensor]:
+    def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the inputs of Mitsuba's scene at a configuration (d,), without a graph."""
         inputs = self.scene.assembly(self.space.inputs(u))
         return {
@@ -310,24 +318,26 @@ class Renderer:
         The ray through the center of each pixel counts. What controls do to the
         finished image moves nothing in it.
         """
-        return self.surfaces(u).seen(OBJECT)
+        return self.surfaces(u).visible_mask(OBJECT)
 
     def surfaces(
-        self, u: Configuration, fineness: int = 1, camera: int = 0
+        self, u: Configuration, subdivision: int = 1, camera: int = 0
     ) -> Surfaces:
         """Find what the camera sees first through the center of each pixel.
 
         Args:
             u: (d,) configuration.
-            fineness: divide each pixel into that many rows and columns.
+            subdivision: divide each pixel into that many rows and columns.
             camera: index of the camera of a rig.
         """
         u, _ = self._check_arguments(u, 1)
         with torch.no_grad():
-            rig = self.scene.made[0].rig
+            rig = self.scene.definition[0].rig
             inputs = self._camera_inputs(rig[camera] if rig else None, u)
-            surfaces = self.scene.surfaces(_select_scene_inputs(inputs), fineness)
-        metres = self.scene.made[0].metres
+            surfaces = self.scene.find_surfaces(
+                _select_scene_inputs(inputs), subdivision
+            )
+        metres = self.scene.definition[0].metres
         return replace(
             surfaces, depth=surfaces.depth * metres, z_depth=surfaces.z_depth * metres
         )
@@ -355,7 +365,7 @@ class Renderer:
         Returns:
             The loss without graph, and (d,) float32.
         """
-        self._left_out = BY_DIFFERENCES if free else frozenset({"secant"})
+        self._left_out = DIFFERENCE_ESTIMATORS if free else frozenset({"secant"})
         try:
             with torch.inference_mode(False), torch.enable_grad():
                 leaf = u.detach().clone().requires_grad_()
@@ -371,8 +381,8 @@ class Renderer:
         noise_seed = seeds.stream(self.root_seed, "differences", seed)
         difference_spp = self.plan.spp or spp
         with torch.no_grad():
-            for group in self.plan.having("secant"):
-                central(
+            for group in self.plan.groups_with("secant"):
+                write_central_differences(
                     lambda at: loss(self._render_image(at, noise_seed, difference_spp)),
                     group,
                     u.detach(),
@@ -412,11 +422,11 @@ class Renderer:
                 "be differentiated with respect to "
                 "it; make it outside, or pass `u.detach()` for the picture alone"
             )
-        with _no_inference():
+        with _leave_inference_mode():
             u = u.clone() if u.is_inference() else u
             if self._predict is not None or not u.requires_grad:
                 return u, u
-            mask = self.plan.through
+            mask = self.plan.autograd_mask
             if bool(mask.all()):
                 return u, u
             return u, u.detach() + mask * (u - u.detach())
@@ -430,24 +440,24 @@ class Renderer:
         """
         renders_before = self.renders
         images = list[Tensor]()
-        for index, mount in enumerate(self.scene.made[0].rig or (None,)):
+        for index, mount in enumerate(self.scene.definition[0].rig or (None,)):
             camera_seed = seeds.stream(seed, "camera", index) if index else seed
             inputs = self._camera_inputs(mount, u)
             hide = "backdrop.color" in inputs
             if self.moments:
                 rendered = self._render_exposure(mount, u, camera_seed, spp, hide)
             else:
-                rendered = self.rendered(
+                rendered = self.render_radiance(
                     _select_scene_inputs(inputs), camera_seed, spp, hide
                 )
-            images.append(self.finished(rendered, inputs, u, display=display))
+            images.append(self.finish_image(rendered, inputs, u, display=display))
         if len(images) == 1:
             return images[0]
         self.renders = renders_before + 1  # one configuration, as budgets count it
         return torch.cat(images, dim=1)
 
     def _camera_inputs(
-        self, mount: Mount | None, u: Tensor, space: Later | None = None
+        self, mount: Mount | None, u: Tensor, space: InputMapping | None = None
     ) -> dict[str, Tensor]:
         """Return the scene inputs of u for a camera of a rig, or for the only one.
 
@@ -455,14 +465,14 @@ class Renderer:
         """
         if space is None:
             space = self.space
-            if mount is not None and mount.later:
-                space = self.space.later(mount.later)
+            if mount is not None and mount.delay:
+                space = self.space.later(mount.delay)
         inputs = self.scene.assembly(space.inputs(u))
         if mount is None:
             return inputs
-        description = self.scene.made[0]
+        description = self.scene.definition[0]
         pose, center = _base_pose_and_center(description)
-        return mount.seen(inputs, pose, center, description.metres)
+        return mount.make_inputs(inputs, pose, center, description.metres)
 
     def _render_exposure(
         self, mount: Mount | None, u: Tensor, seed: int, spp: int, hide: bool
@@ -478,15 +488,17 @@ class Renderer:
         for index, moment in enumerate(self.moments):
             inputs = _select_scene_inputs(self._camera_inputs(mount, u, moment.space))
             moment_seed = seeds.stream(seed, "moment", index)
-            rows = moment.rows[:, None, None]
-            samples = max(1, math.ceil(spp * moment.samples))
-            exposed = exposed + rows * self.rendered(
+            rows = moment.row_fractions[:, None, None]
+            samples = max(1, math.ceil(spp * moment.sample_fraction))
+            exposed = exposed + rows * self.render_radiance(
                 inputs, moment_seed, samples, hide, denoised=False
             )
             if is_denoised:
                 with torch.no_grad():
                     guide_seed = seeds.stream(self.root_seed, "guides", moment_seed)
-                    albedo, normal = self.scene.guides(inputs, guide_seed, samples)
+                    albedo, normal = self.scene.render_guides(
+                        inputs, guide_seed, samples
+                    )
                     guides = guides + rows * torch.cat([albedo, normal], dim=-1)
         self.renders = renders_before + 1
         if not is_denoised:
@@ -503,7 +515,7 @@ class Renderer:
             change = torch.cat([clean - noisy, no_coverage], dim=-1)
         return exposed + change  # its derivative is that without a denoiser
 
-    def finished(
+    def finish_image(
         self,
         rendered: Tensor,
         inputs: Mapping[str, Tensor],
@@ -531,12 +543,12 @@ class Renderer:
             return radiance
         return self.space.picture(u, self.formation.display(radiance))
 
-    def rendered(
+    def render_radiance(
         self,
         inputs: Mapping[str, Tensor],
         seed: int,
         spp: int,
-        hide: bool,
+        hide_environment: bool,
         *,
         denoised: bool = True,
     ) -> Tensor:
@@ -548,7 +560,7 @@ class Renderer:
             inputs: of the scene.
             seed: of the noise.
             spp: samples per pixel.
-            hide: hide the environment behind a backdrop.
+            hide_environment: hide the environment behind a backdrop.
             denoised: denoise it if the formation requires it.
 
         Returns:
@@ -557,11 +569,11 @@ class Renderer:
         if self._predict is not None:
             return self._predict(inputs)
         radiance: Tensor = _Radiance.apply(  # type: ignore[no-untyped-call]
-            self, tuple(inputs), seed, spp, hide, denoised, *inputs.values()
+            self, tuple(inputs), seed, spp, hide_environment, denoised, *inputs.values()
         )
         return radiance
 
-    def finite(self, values: Tensor) -> Tensor:
+    def replace_non_finite(self, values: Tensor) -> Tensor:
         """Replace NaN and infinite entries by zero and count them."""
         if bool(torch.isfinite(values.sum())):
             return values
@@ -571,11 +583,13 @@ class Renderer:
 
     # ---- differences
 
-    def _differenced(self) -> tuple[Group, ...]:
+    def _groups_by_differences(self) -> tuple[Group, ...]:
         """Return the groups that use differences."""
-        return self.plan.having(*(BY_DIFFERENCES - self._left_out))
+        return self.plan.groups_with(*(DIFFERENCE_ESTIMATORS - self._left_out))
 
-    def differences(self, u: Tensor, cotangent: Tensor, seed: int, spp: int) -> Tensor:
+    def compute_differences(
+        self, u: Tensor, cotangent: Tensor, seed: int, spp: int
+    ) -> Tensor:
         """Return the gradient of `sum(cotangent * image)` by differences.
 
         It is zero for coordinates that do not use them. All renders share one seed
@@ -585,32 +599,34 @@ class Renderer:
         noise_seed = seeds.stream(self.root_seed, "differences", seed)
         spp = self.plan.spp or spp
         derivative = torch.zeros_like(u)
-        for group in self._differenced():
-            central(
+        for group in self._groups_by_differences():
+            write_central_differences(
                 lambda at: (cotangent * self._render_image(at, noise_seed, spp)).sum(),
                 group,
                 u,
                 derivative,
             )
-        return self.finite(derivative)
+        return self.replace_non_finite(derivative)
 
     # ---- set-up
 
-    def _steps(self, groups: tuple[Group, ...], motion: Motion | None) -> Tensor:
+    def _compute_steps(
+        self, groups: tuple[Group, ...], motion: Motion | None
+    ) -> Tensor:
         """Return half-widths (d,) of differences over which outlines move by a pixel."""
         speeds = torch.zeros(len(self.start))
         coordinates: list[int] = []
         for group in groups:
             may_move = {*group.valid} - {"adjoint", "image"}
-            if may_move and group.size <= MOST_MEASURED:
+            if may_move and group.size <= MAX_MEASURED_SIZE:
                 coordinates += range(group.begin, group.begin + group.size)
         if motion is not None and coordinates:
-            speeds = motion.speeds(
+            speeds = motion.measure_speeds(
                 lambda u: self.scene.assembly(self.space.inputs(u)),
                 self.start,
                 coordinates,
             )
-        steps = steps_for(speeds)
+        steps = compute_steps(speeds)
         for group in groups:
             if group.periodic and not bool(speeds[group.coordinates].any()):
                 steps[group.coordinates] = TURN_STEP
@@ -621,7 +637,7 @@ class Renderer:
 
         They are found by autograd at a point inside the box.
         """
-        if not any(set(group.valid) & BY_ADJOINT for group in groups):
+        if not any(set(group.valid) & ADJOINT_ESTIMATORS for group in groups):
             return {}
         routes: dict[str, set[str]] = {group.name: set() for group in groups}
         generator = torch.Generator().manual_seed(0)
@@ -651,16 +667,16 @@ def _base_pose_and_center(description: SceneDescription) -> tuple[Tensor, Tensor
     They are cached, since the center takes all vertices.
     """
     pose = camera_to_world(description)
-    center = middle(description)
+    center = compute_center(description)
     return torch.from_numpy(pose).float(), torch.from_numpy(center).float()
 
 
 def _select_scene_inputs(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the inputs that belong to Mitsuba's scene, not to the finished image."""
-    return {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+    return {name: value for name, value in inputs.items() if name not in IMAGE_INPUTS}
 
 
-def _no_inference() -> AbstractContextManager[object]:
+def _leave_inference_mode() -> AbstractContextManager[object]:
     """Return a context of ordinary mode inside of torch's inference mode.
 
     To set it where it is set already would cost time.
@@ -711,8 +727,8 @@ class _Radiance(torch.autograd.Function):
             if denoised and renderer.formation.denoiser == "oidn":
                 guide_seed = seeds.stream(renderer.root_seed, "guides", seed)
                 image_seeds["guides"] = guide_seed
-            rendered, *guides = renderer.scene.pictures(inputs, image_seeds, spp)
-        rendered = renderer.finite(rendered)
+            rendered, *guides = renderer.scene.render_images(inputs, image_seeds, spp)
+        rendered = renderer.replace_non_finite(rendered)
         for guide in guides:
             clean = denoise(
                 rendered[..., :3].contiguous(),
@@ -725,7 +741,7 @@ class _Radiance(torch.autograd.Function):
         return rendered
 
     @staticmethod
-    @first_order
+    @forbid_second_derivatives
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradient of `sum(cotangent * radiance)` by an adjoint.
 
@@ -735,7 +751,7 @@ class _Radiance(torch.autograd.Function):
         renderer: Renderer = ctx.renderer
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
         noise_seed = seeds.stream(renderer.root_seed, "gradient", ctx.seed)
-        cotangent = renderer.finite(cotangent[..., :3])
+        cotangent = renderer.replace_non_finite(cotangent[..., :3])
         by_input = dict[str, Tensor]()
         remaining = list(inputs)
         # what two reach goes to the more general one
@@ -747,17 +763,17 @@ class _Radiance(torch.autograd.Function):
             remaining = [name for name in remaining if name not in reached]
             if estimator == "material":
                 meshes = sorted({name.rpartition(".")[0] for name in wrt})
-                gradients = renderer.scene.material_adjoint(
+                gradients = renderer.scene.render_material_adjoint(
                     inputs, cotangent, noise_seed, ctx.spp, meshes=meshes
                 )
             else:
                 method = "hidden" if ctx.hide else "path"
-                gradients = renderer.scene.adjoint(
+                gradients = renderer.scene.render_adjoint(
                     inputs, cotangent, noise_seed, ctx.spp, wrt=wrt, method=method
                 )
             renderer.gradients += 1
             for name, gradient in gradients.items():
-                by_input[name] = renderer.finite(gradient)
+                by_input[name] = renderer.replace_non_finite(gradient)
         no_gradients = (None,) * 6  # of the arguments before the tensors
         return (*no_gradients, *(by_input.get(name) for name in ctx.names))
 
@@ -768,9 +784,11 @@ def _reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:
     Of the interior adjoint, only those that it differentiates correctly count.
     """
     reached: frozenset[str] = frozenset()
-    for group in renderer.plan.having(estimator):
+    for group in renderer.plan.groups_with(estimator):
         reached |= renderer.routes.get(group.name, frozenset())
-    return reached & renderer.scene.interior if estimator == "adjoint" else reached
+    return (
+        reached & renderer.scene.interior_inputs if estimator == "adjoint" else reached
+    )
 
 
 class _Differences(torch.autograd.Function):
@@ -787,7 +805,7 @@ class _Differences(torch.autograd.Function):
         return image.view_as(image)
 
     @staticmethod
-    @first_order
+    @forbid_second_derivatives
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         (u,) = ctx.saved_tensors
         derivative = ctx.renderer.differences(u, cotangent, ctx.seed, ctx.spp)

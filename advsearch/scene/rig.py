@@ -19,18 +19,18 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Doubles, pose_of
-from advsearch.scene.camera_files import LARGEST_JSON, OF_A_FRAME, read_camera
+from advsearch.scene.assets import Float64Array, make_pose
+from advsearch.scene.camera_files import LENS_KEYS, MAX_JSON_SIZE, read_camera
 from advsearch.scene.camera_model import CameraModel
-from advsearch.scene.geometry import rotation
-from advsearch.scene.skeleton import entries_of_turn
+from advsearch.scene.geometry import make_rotation
+from advsearch.scene.skeleton import rotation_entries
 from advsearch.trust.stored_files import parse_json, parsed, present_text, read_text
 from advsearch.trust.yaml_text import LARGEST, parse_yaml
 
-MOST_CAMERAS = 32
-FARTHEST = 1e4  # limit of the distance to the first camera, metres or object sizes
-KEYS = ("name", "place", "turn", "around", "fov", "later")
-LATEST = 60.0  # limit of the seconds after the first image
+MAX_CAMERAS = 32
+MAX_DISTANCE = 1e4  # limit of the distance to the first camera, metres or object sizes
+ENTRY_KEYS = ("name", "place", "turn", "around", "fov", "later")
+MAX_DELAY = 60.0  # limit of the seconds after the first image
 # From x to the right, y down, z ahead to Mitsuba's axes: left, up, ahead.
 AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -38,10 +38,12 @@ FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 y down, z ahead.
 """
 # Lower limit of the scale of positions in a file; its inverse is the upper limit.
-SMALLEST_SCALE = 1e-6
-COLMAPS = "images.txt"
-MOST_BYTES = 1 << 26  # limit of COLMAP's images; their lines of points are skipped
-STEP = "T_cn_cnm1"  # Kalibr's transform from the previous camera to this one
+MIN_SCALE = 1e-6
+COLMAP_IMAGES = "images.txt"
+MAX_IMAGES_SIZE = 1 << 26  # limit of COLMAP's images; their lines of points are skipped
+KALIBR_TRANSFORM = (
+    "T_cn_cnm1"  # Kalibr's transform from the previous camera to this one
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,34 +53,38 @@ class Mount:
     name: str
     # (4, 4) from its axes, x to the right, y down, z ahead, to those of the first
     # camera; metres, or object sizes.
-    pose: Doubles
+    pose: Float64Array
     # Azimuth around the object relative to the first camera, degrees
     # counter-clockwise from above.
-    around: float = 0.0
+    azimuth: float = 0.0
     fov: float | None = None  # degrees along the larger side; None for the first's
     model: CameraModel | None = None  # intrinsics and distortion; None for the first's
     # Seconds after the first image, along the path of a control.
-    later: float = 0.0
+    delay: float = 0.0
 
-    def seen(
-        self, inputs: Mapping[str, Tensor], first: Tensor, middle: Tensor, metres: float
+    def make_inputs(
+        self,
+        inputs: Mapping[str, Tensor],
+        first_pose: Tensor,
+        center: Tensor,
+        unit_metres: float,
     ) -> dict[str, Tensor]:
         """Return the scene inputs of this camera, given those of the first camera.
 
         Args:
             inputs: scene inputs of the first camera.
-            first: (4, 4) its pose, if the inputs have none.
-            middle: (3,) center of the object.
-            metres: length of a unit of the scene.
+            first_pose: (4, 4) its pose, if the inputs have none.
+            center: (3,) center of the object.
+            unit_metres: length of a unit of the scene.
         """
         pose = torch.from_numpy(AXES @ self.pose @ AXES).float()
-        pose[:3, 3] /= metres
+        pose[:3, 3] /= unit_metres
         turn = torch.eye(4)
-        turn[:3, :3] = torch.from_numpy(rotation(self.around, 0.0, 0.0))
-        turn[:3, 3] = middle - turn[:3, :3] @ middle
+        turn[:3, :3] = torch.from_numpy(make_rotation(self.azimuth, 0.0, 0.0))
+        turn[:3, 3] = center - turn[:3, :3] @ center
         camera_inputs = {
             **inputs,
-            "camera.to_world": turn @ inputs.get("camera.to_world", first) @ pose,
+            "camera.to_world": turn @ inputs.get("camera.to_world", first_pose) @ pose,
         }
         if self.fov is not None:
             camera_inputs["camera.fov"] = torch.tensor([self.fov])
@@ -102,14 +108,14 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
         (``#cam1``).
 
     Raises:
-        FileFormatError: there are more than `MOST_CAMERAS`, numbers that no camera has,
+        FileFormatError: there are more than `MAX_CAMERAS`, numbers that no camera has,
             or models of different kinds.
     """
     path, _, which = spec.partition("#")
-    if Path(path).name == COLMAPS:
-        return _of_colmap(path, which)
+    if Path(path).name == COLMAP_IMAGES:
+        return _read_colmap(path, which)
     if Path(path).suffix.lower() == ".json" and "," in which:
-        return _of_transforms(path, which)
+        return _read_transforms(path, which)
     if which or Path(spec).suffix.lower() not in (".yaml", ".yml"):
         return ()
     try:
@@ -126,10 +132,10 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
                 f"{', '.join(map(str, data))[:80]}"
             )
         mounts = tuple(
-            _of_entry(spec, index, entry) for index, entry in enumerate(entries)
+            _read_entry(spec, index, entry) for index, entry in enumerate(entries)
         )
     else:
-        mounts = _of_camchain(spec, data)
+        mounts = _read_camchain(spec, data)
     if mounts:
         _check_mounts(spec, mounts)
     return mounts
@@ -137,27 +143,27 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
 
 def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
     """Raise FileFormatError unless cameras are few, unique, and the first is in place."""
-    if not 2 <= len(mounts) <= MOST_CAMERAS:
+    if not 2 <= len(mounts) <= MAX_CAMERAS:
         raise FileFormatError(
-            f"{spec}: expected 2 to {MOST_CAMERAS} cameras, got {len(mounts)}"
+            f"{spec}: expected 2 to {MAX_CAMERAS} cameras, got {len(mounts)}"
         )
     if len({mount.name for mount in mounts}) < len(mounts):
         raise FileFormatError(f"{spec}: expected a name of its own for each camera")
     first = mounts[0]
     is_moved = not np.allclose(first.pose, np.eye(4))
-    if is_moved or first.around or first.later:
+    if is_moved or first.azimuth or first.delay:
         raise FileFormatError(
             f"{spec}: the first camera is the scene's own; it takes "
             "no place, turn, around or later"
         )
 
 
-def _of_entry(spec: str, index: int, entry: Any) -> Mount:
+def _read_entry(spec: str, index: int, entry: Any) -> Mount:
     """Return the camera of an entry of our own format."""
     where = f"{spec}: camera {index + 1}"
-    if not isinstance(entry, dict) or not set(entry) <= set(KEYS):
+    if not isinstance(entry, dict) or not set(entry) <= set(ENTRY_KEYS):
         raise FileFormatError(
-            f"{where}: expected entries among {', '.join(KEYS)}, got "
+            f"{where}: expected entries among {', '.join(ENTRY_KEYS)}, got "
             f"{str(entry)[:80]!r}"
         )
     name = entry.get("name", f"camera {index + 1}")
@@ -166,30 +172,36 @@ def _of_entry(spec: str, index: int, entry: Any) -> Mount:
             f"{where}: name: expected a short text, got {str(name)[:80]!r}"
         )
     angles = entry.get("turn", [0.0] * 3)
-    yaw, pitch, roll = _numbers(where, "turn", angles, 3, 3600.0)
+    yaw, pitch, roll = _parse_numbers(where, "turn", angles, 3, 3600.0)
     # About y, x and z.
     turn = (
-        rotation(0.0, yaw, 0.0) @ rotation(0.0, 0.0, pitch) @ rotation(roll, 0.0, 0.0)
+        make_rotation(0.0, yaw, 0.0)
+        @ make_rotation(0.0, 0.0, pitch)
+        @ make_rotation(roll, 0.0, 0.0)
     )
-    position = _numbers(where, "place", entry.get("place", [0.0] * 3), 3, FARTHEST)
-    pose = pose_of(turn, position)
-    (around,) = _numbers(where, "around", [entry.get("around", 0.0)], 1, 3600.0)
+    position = _parse_numbers(
+        where, "place", entry.get("place", [0.0] * 3), 3, MAX_DISTANCE
+    )
+    pose = make_pose(turn, position)
+    (around,) = _parse_numbers(where, "around", [entry.get("around", 0.0)], 1, 3600.0)
     fov = None
     if "fov" in entry:
-        (fov,) = _numbers(where, "fov", [entry["fov"]], 1, 170.0)
+        (fov,) = _parse_numbers(where, "fov", [entry["fov"]], 1, 170.0)
         if fov < 1.0:
             raise FileFormatError(
                 f"{where}: fov: expected 1 to 170 degrees, got {fov:g}"
             )
-    (later,) = _numbers(where, "later", [entry.get("later", 0.0)], 1, LATEST)
+    (later,) = _parse_numbers(where, "later", [entry.get("later", 0.0)], 1, MAX_DELAY)
     if later < 0.0:
         raise FileFormatError(
-            f"{where}: later: expected 0 to {LATEST:g} seconds, got {later:g}"
+            f"{where}: later: expected 0 to {MAX_DELAY:g} seconds, got {later:g}"
         )
-    return Mount(name, pose, around, fov, later=later)
+    return Mount(name, pose, around, fov, delay=later)
 
 
-def _numbers(where: str, key: str, value: Any, count: int, limit: float) -> list[float]:
+def _parse_numbers(
+    where: str, key: str, value: Any, count: int, limit: float
+) -> list[float]:
     """Return a list of `count` numbers up to a limit, or raise FileFormatError."""
     is_valid = (
         isinstance(value, list)
@@ -207,14 +219,14 @@ def _numbers(where: str, key: str, value: Any, count: int, limit: float) -> list
     return list(map(float, value))
 
 
-def _rows(value: Any) -> list[list[Any]]:
+def _to_rows(value: Any) -> list[list[Any]]:
     """Return a list of lists as it is, and an empty list for any other value."""
     if not isinstance(value, list) or not all(isinstance(row, list) for row in value):
         return []
     return value
 
 
-def _of_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
+def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
     """Return the cameras of Kalibr's camchain; empty if it has no extrinsics."""
     cameras = {
         name: camera
@@ -224,21 +236,23 @@ def _of_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
     names = sorted(cameras, key=lambda name: (len(str(name)), str(name)))
     if (
         len(names) < 2
-        or len(names) > MOST_CAMERAS
-        or not all(STEP in cameras[name] for name in names[1:])
+        or len(names) > MAX_CAMERAS
+        or not all(KALIBR_TRANSFORM in cameras[name] for name in names[1:])
     ):
         return ()
     poses = [np.eye(4)]
     for name in names[1:]:
-        from_previous = _rigid(f"{spec}: {name}", STEP, cameras[name][STEP])
+        from_previous = _parse_rigid(
+            f"{spec}: {name}", KALIBR_TRANSFORM, cameras[name][KALIBR_TRANSFORM]
+        )
         poses.append(poses[-1] @ np.linalg.inv(from_previous))
     models = [read_camera(f"{spec}#{name}") for name in names]
-    return _mounted(spec, names, poses, models)
+    return _make_mounts(spec, names, poses, models)
 
 
-def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
+def _read_transforms(path: str, frame_names: str) -> tuple[Mount, ...]:
     """Return frames of nerfstudio's transforms.json as cameras."""
-    text = present_text(path, "a camera file", LARGEST_JSON)
+    text = present_text(path, "a camera file", MAX_JSON_SIZE)
     data = parsed(path, text, "JSON", parse_json)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(
@@ -248,19 +262,21 @@ def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
             f"{path}: expected `frames`, a list with a camera each, "
             "as nerfstudio writes it"
         )
-    names = _named(path, which, [str(index) for index in range(len(frames))])
+    names = _parse_names(
+        path, frame_names, [str(index) for index in range(len(frames))]
+    )
     selected = [frames[int(name)] for name in names]
     scale = _read_applied_scale(path, data)
-    poses = list[Doubles]()
+    poses = list[Float64Array]()
     for name, frame in zip(names, selected, strict=True):
-        matrix = _rigid(
+        matrix = _parse_rigid(
             f"{path}: frame {name}", "transform_matrix", frame.get("transform_matrix")
         )
         pose = matrix @ FROM_OPENGL
         pose[:3, 3] /= scale
         poses.append(pose)
     lenses = [
-        {key: frame[key] for key in frame if key in OF_A_FRAME} for frame in selected
+        {key: frame[key] for key in frame if key in LENS_KEYS} for frame in selected
     ]
     first_model = read_camera(f"{path}#{names[0]}")
     models = []
@@ -268,7 +284,7 @@ def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
         # Frames with the same lens share its model.
         is_same = lens == lenses[0]
         models.append(first_model if is_same else read_camera(f"{path}#{name}"))
-    return _mounted(path, names, poses, models)
+    return _make_mounts(path, names, poses, models)
 
 
 def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
@@ -281,14 +297,14 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
     """
     scale = 1.0
     if data.get("applied_scale") is not None:
-        (scale,) = _numbers(
-            path, "applied_scale", [data["applied_scale"]], 1, 1.0 / SMALLEST_SCALE
+        (scale,) = _parse_numbers(
+            path, "applied_scale", [data["applied_scale"]], 1, 1.0 / MIN_SCALE
         )
     if data.get("applied_transform") is not None:
-        rows = _rows(data["applied_transform"])
+        rows = _to_rows(data["applied_transform"])
         cells = [cell for row in rows for cell in row]
         count = 12 if len(rows) == 3 else 16
-        numbers = _numbers(path, "applied_transform", cells, count, FARTHEST)
+        numbers = _parse_numbers(path, "applied_transform", cells, count, MAX_DISTANCE)
         turn = np.reshape(numbers, (-1, 4))[:3, :3]
         turn_scale = abs(float(np.linalg.det(turn))) ** (1.0 / 3.0)
         if not np.allclose(
@@ -299,8 +315,8 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
                 "got another map"
             )
         scale *= turn_scale
-    if not SMALLEST_SCALE <= scale <= 1.0 / SMALLEST_SCALE:
-        limits = f"from {SMALLEST_SCALE:g} to {1.0 / SMALLEST_SCALE:g}"
+    if not MIN_SCALE <= scale <= 1.0 / MIN_SCALE:
+        limits = f"from {MIN_SCALE:g} to {1.0 / MIN_SCALE:g}"
         raise FileFormatError(
             f"{path}: applied_scale: expected a scale {limits}, got "
             f"{scale:g}; correct it"
@@ -308,36 +324,36 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
     return scale
 
 
-def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
+def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
     """Return the images of COLMAP's images.txt as cameras.
 
     Every second line has a rotation (quaternion, real part first) and a shift from the
     world to the camera, whose model is in the cameras.txt beside it.
     """
-    text = present_text(path, "COLMAP's images", MOST_BYTES)
+    text = present_text(path, "COLMAP's images", MAX_IMAGES_SIZE)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     rows = {words[0]: words for line in lines[::2] if (words := line.split(maxsplit=9))}
     if not rows:
         raise FileFormatError(
-            f"{path}: expected 2 to {MOST_CAMERAS} different cameras, got none"
+            f"{path}: expected 2 to {MAX_CAMERAS} different cameras, got none"
         )
     if len(rows) < sum(bool(line.strip()) for line in lines[::2]):
         raise FileFormatError(
             f"{path}: expected each image once, got one with the "
             "same number twice; correct the file"
         )
-    names = _named(path, which or ",".join(rows), list(rows))
-    poses = list[Doubles]()
+    names = _parse_names(path, image_ids or ",".join(rows), list(rows))
+    poses = list[Float64Array]()
     models = list[CameraModel]()
     cameras_path = Path(path).with_name("cameras.txt")
     for name in names:
         words = rows[name]
         poses.append(_parse_image(f"{path}: image {name[:40]}", words))
         models.append(read_camera(f"{cameras_path}#{words[8]}"))
-    return _mounted(path, names, poses, models)
+    return _make_mounts(path, names, poses, models)
 
 
-def _parse_image(where: str, words: Sequence[str]) -> Doubles:
+def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
     """Return the pose (4, 4), from the camera to the world, of an image of COLMAP."""
     if len(words) != 10:
         raise FileFormatError(
@@ -349,29 +365,29 @@ def _parse_image(where: str, words: Sequence[str]) -> Doubles:
         numbers = list(map(float, words[1:8]))
     except ValueError:
         numbers = []
-    w, x, y, z, *shift = _numbers(where, "pose", numbers, 7, FARTHEST)
+    w, x, y, z, *shift = _parse_numbers(where, "pose", numbers, 7, MAX_DISTANCE)
     length = math.sqrt(w * w + x * x + y * y + z * z)
     if not 0.99 < length < 1.01:
         raise FileFormatError(
             f"{where}: expected a quaternion of length 1, got one of {length:.3g}"
         )
     turn = np.reshape(
-        entries_of_turn(x / length, y / length, z / length, w / length), (3, 3)
+        rotation_entries(x / length, y / length, z / length, w / length), (3, 3)
     )
-    return np.asarray(np.linalg.inv(pose_of(turn, shift)), np.float64)
+    return np.asarray(np.linalg.inv(make_pose(turn, shift)), np.float64)
 
 
-def _named(path: str, which: str, known: Sequence[str]) -> list[str]:
+def _parse_names(path: str, listing_text: str, known_names: Sequence[str]) -> list[str]:
     """Return the names of cameras in a list with commas, or raise FileFormatError."""
-    names = list(map(str.strip, which.split(",")))
-    if not 2 <= len(names) <= MOST_CAMERAS or len(set(names)) < len(names):
+    names = list(map(str.strip, listing_text.split(",")))
+    if not 2 <= len(names) <= MAX_CAMERAS or len(set(names)) < len(names):
         raise FileFormatError(
-            f"{path}: expected 2 to {MOST_CAMERAS} different cameras, got {len(names)}"
+            f"{path}: expected 2 to {MAX_CAMERAS} different cameras, got {len(names)}"
         )
-    unknown = [name for name in names if name not in known]
+    unknown = [name for name in names if name not in known_names]
     if unknown:
-        listing = ", ".join(known[:8])
-        if len(known) > 8:
+        listing = ", ".join(known_names[:8])
+        if len(known_names) > 8:
             listing += ", ..."
         raise FileFormatError(
             f"{path}: expected some of its cameras {listing}, got {unknown[0][:40]!r}"
@@ -379,10 +395,10 @@ def _named(path: str, which: str, known: Sequence[str]) -> list[str]:
     return names
 
 
-def _mounted(
+def _make_mounts(
     spec: str,
     names: Sequence[object],
-    poses: Sequence[Doubles],
+    poses: Sequence[Float64Array],
     models: Sequence[CameraModel],
 ) -> tuple[Mount, ...]:
     """Return cameras relative to the first.
@@ -402,10 +418,10 @@ def _mounted(
     )
 
 
-def _rigid(where: str, key: str, value: Any) -> Doubles:
+def _parse_rigid(where: str, key: str, value: Any) -> Float64Array:
     """Return an entry as a rigid transform (4, 4), or raise FileFormatError."""
-    cells = [cell for row in _rows(value) for cell in row]
-    numbers = _numbers(where, key, cells, 16, FARTHEST)
+    cells = [cell for row in _to_rows(value) for cell in row]
+    numbers = _parse_numbers(where, key, cells, 16, MAX_DISTANCE)
     matrix = np.array(numbers).reshape(4, 4)
     turn = matrix[:3, :3]
     is_rotation = (

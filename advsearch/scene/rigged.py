@@ -23,16 +23,22 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.options import Value
-from advsearch.scene.assets import Doubles, Ints
-from advsearch.scene.people import PARAMETERS, about
+from advsearch.scene.assets import Float64Array, IntArray
+from advsearch.scene.people import PARAMETERS, rotation_about
 from advsearch.scene.settings import Parameter
-from advsearch.scene.skeleton import Clip, Movable, Track, entries_of_turn, with_above
+from advsearch.scene.skeleton import (
+    Clip,
+    Movable,
+    Track,
+    rotation_entries,
+    with_ancestors,
+)
 
 AXES = ("x", "y", "z")
-PERSON = PARAMETERS  # all parameters of a person
+PERSON_PARAMETERS = PARAMETERS  # all parameters of a person
 WEIGHT = "weight"
-_moving = partial(Parameter.moving, Parameter.GEOMETRIC)
-TIME = _moving(
+_rig_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
+TIME = _rig_parameter(
     "time",
     "1",
     0.0,
@@ -42,19 +48,19 @@ TIME = _moving(
     (0.0, 1.0),
 )
 # Cosine of the angle between rotations beyond which arc and chord are the same.
-NEARLY_ONE = 1.0 - 1e-9
+MAX_ARC_COSINE = 1.0 - 1e-9
 
 
-def part_of_a_rig(name: str) -> Parameter | None:
+def find_rig_parameter(name: str) -> Parameter | None:
     """Return the parameter of a name `JOINT.x` (or y, z) or `TARGET.weight`, or None."""
     owner, dot, component = name.rpartition(".")
     if not (owner and dot and component in (*AXES, WEIGHT)):
         return None
     if component == WEIGHT:
-        return _moving(
+        return _rig_parameter(
             name, "1", 0.0, 1.0, 0.0, f"How much of the morph target {owner} there is."
         )
-    return _moving(
+    return _rig_parameter(
         name,
         "degrees",
         -360.0,
@@ -75,7 +81,7 @@ class SkeletonRig:
     """
 
     def __init__(
-        self, parts: Sequence[Movable], vertices: Ints, to_mesh: Doubles
+        self, parts: Sequence[Movable], vertices: IntArray, to_mesh: Float64Array
     ) -> None:
         self.skeleton = parts[0].skeleton
         self._to_mesh = torch.from_numpy(to_mesh)
@@ -101,22 +107,24 @@ class SkeletonRig:
         self._weights = torch.from_numpy(weights[vertices])
         self._nodes = torch.from_numpy(np.concatenate([part.nodes for part in parts]))
         self._inverse = torch.from_numpy(
-            np.concatenate([part.inverse for part in parts])
+            np.concatenate([part.inverse_binds for part in parts])
         )
         # Name, node, index, weight at rest, vertices and offsets of each morph target.
         self._targets: list[tuple[str, int, int, float, Tensor, Tensor]] = []
         self._add_targets(parts, vertices)
-        self._levels = _node_levels(self.skeleton.parents)
-        self._back = torch.argsort(torch.cat([nodes for nodes, _ in self._levels]))
-        self._local_matrices = torch.from_numpy(self.skeleton.places)
+        self._levels = _group_by_depth(self.skeleton.parents)
+        self._node_order = torch.argsort(
+            torch.cat([nodes for nodes, _ in self._levels])
+        )
+        self._local_matrices = torch.from_numpy(self.skeleton.local_matrices)
         # The rotation nearest to each node's matrix in the scene, without its scale and
         # shear.
-        world = self._world(self._local_matrices)[:, :3, :3].numpy()
+        world = self._compute_world(self._local_matrices)[:, :3, :3].numpy()
         left, _, right = np.linalg.svd(world)
         self._axes = torch.from_numpy(left @ right)
-        self._rest = self.posed({})
+        self._rest = self.pose({})
 
-    def _add_targets(self, parts: Sequence[Movable], vertices: Ints) -> None:
+    def _add_targets(self, parts: Sequence[Movable], vertices: IntArray) -> None:
         """Store the morph targets of parts, for the vertices of the mesh."""
         counts = [len(part.vertices) for part in parts]
         starts = np.cumsum([0, *counts])
@@ -133,9 +141,9 @@ class SkeletonRig:
                         target.name,
                         part.node,
                         index,
-                        float(part.rest[index]),
+                        float(part.rest_weights[index]),
                         torch.from_numpy(mesh_rows[is_moved]),
-                        torch.from_numpy(target.moves[target_rows[is_moved]]),
+                        torch.from_numpy(target.offsets[target_rows[is_moved]]),
                     )
                 )
 
@@ -149,7 +157,9 @@ class SkeletonRig:
     @cached_property
     def joints(self) -> dict[str, int]:
         """The nodes that move something, by name."""
-        moving = with_above(self.skeleton.parents, [int(node) for node in self._nodes])
+        moving = with_ancestors(
+            self.skeleton.parents, [int(node) for node in self._nodes]
+        )
         return {self.skeleton.names[node]: node for node in sorted(moving)}
 
     @property
@@ -173,7 +183,8 @@ class SkeletonRig:
     def parameters(self) -> tuple[Parameter, ...]:
         """The time of a clip, turns of joints and weights of morph targets."""
         parameters = (
-            TIME if name == TIME.name else part_of_a_rig(name) for name in self.defaults
+            TIME if name == TIME.name else find_rig_parameter(name)
+            for name in self.defaults
         )
         return tuple(parameter for parameter in parameters if parameter is not None)
 
@@ -183,7 +194,7 @@ class SkeletonRig:
         """Return the time in a clip, in seconds."""
         if clip is None:
             return {}
-        _, seconds = self._playing(clip, values)
+        _, seconds = self._find_clip_time(clip, values)
         return {"seconds": {"value": float(seconds), "unit": "s"}}
 
     # ---- Vertices ----
@@ -201,7 +212,7 @@ class SkeletonRig:
         Raises:
             InputError: the file's numbers are so large that vertices are not finite.
         """
-        posed = self.posed(values, clip)
+        posed = self.pose(values, clip)
         offsets = (posed - self._rest.to(posed.device)) @ self._to_mesh.to(
             posed.device
         ).T
@@ -213,7 +224,7 @@ class SkeletonRig:
             )
         return offsets.float()
 
-    def posed(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
+    def pose(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
         """Return the vertices (V, 3) float64 in the file's axes and unit.
 
         Arguments are those of `offsets`.
@@ -223,11 +234,11 @@ class SkeletonRig:
         local_matrices = self._local_matrices.to(device)
         clip_weights = dict[int, Tensor]()
         if clip is not None:
-            playing, seconds = self._playing(clip, number)
-            local_matrices, clip_weights = self._played(playing, seconds.to(device))
-        local_matrices = self._turned(local_matrices, number)
+            playing, seconds = self._find_clip_time(clip, number)
+            local_matrices, clip_weights = self._play_clip(playing, seconds.to(device))
+        local_matrices = self._turn_joints(local_matrices, number)
         joint_matrices = (
-            self._world(local_matrices)[self._nodes.to(device)]
+            self._compute_world(local_matrices)[self._nodes.to(device)]
             @ self._inverse.to(device)
         )[:, :3]
         points = self._morphed_points(number, clip_weights, device)
@@ -268,13 +279,17 @@ class SkeletonRig:
                 )
         return points
 
-    def _playing(self, name: str, values: Mapping[str, Tensor]) -> tuple[Clip, Tensor]:
+    def _find_clip_time(
+        self, name: str, values: Mapping[str, Tensor]
+    ) -> tuple[Clip, Tensor]:
         """Return the clip of a name, and the time in it in seconds."""
         clip = next(clip for clip in self.skeleton.clips if clip.name == name)
         time = values.get(TIME.name, torch.zeros(())).double()
         return clip, clip.begin + (clip.end - clip.begin) * time
 
-    def _played(self, clip: Clip, seconds: Tensor) -> tuple[Tensor, dict[int, Tensor]]:
+    def _play_clip(
+        self, clip: Clip, seconds: Tensor
+    ) -> tuple[Tensor, dict[int, Tensor]]:
         """Return the local matrices (N, 4, 4) of nodes at a time of a clip.
 
         The second result are the weights of morph targets, by node.
@@ -293,9 +308,12 @@ class SkeletonRig:
             tracks = [track for track in clip.tracks if track.path == path]
             if tracks:
                 nodes = torch.tensor([track.node for track in tracks], device=device)
-                values = torch.stack([sampled(track, seconds) for track in tracks])
+                values = torch.stack([sample_track(track, seconds) for track in tracks])
                 properties[path] = properties[path].index_copy(0, nodes, values)
-        scaled_turns = rotation(properties["rotation"]) * properties["scale"][:, None]
+        scaled_turns = (
+            quaternions_to_matrices(properties["rotation"])
+            * properties["scale"][:, None]
+        )
         last_row = torch.tensor(
             [0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=device
         ).expand(len(scaled_turns), 1, 4)
@@ -303,18 +321,20 @@ class SkeletonRig:
             [scaled_turns, properties["translation"][:, :, None]], dim=2
         )
         composed = torch.cat([upper_rows, last_row], dim=1)
-        is_fixed = torch.from_numpy(skeleton.fixed).to(device)
+        is_fixed = torch.from_numpy(skeleton.has_matrix).to(device)
         local_matrices = torch.where(
             is_fixed[:, None, None], self._local_matrices.to(device), composed
         )
         weights = {
-            track.node: sampled(track, seconds)
+            track.node: sample_track(track, seconds)
             for track in clip.tracks
             if track.path == "weights"
         }
         return local_matrices, weights
 
-    def _turned(self, local_matrices: Tensor, number: Mapping[str, Tensor]) -> Tensor:
+    def _turn_joints(
+        self, local_matrices: Tensor, number: Mapping[str, Tensor]
+    ) -> Tensor:
         """Return local matrices (N, 4, 4) with the turns of joints applied.
 
         Turns are about the axes of the object as it stands at rest.
@@ -331,7 +351,7 @@ class SkeletonRig:
             turn = torch.eye(3, dtype=torch.float64, device=device)
             for axis in AXES:
                 if f"{joint}.{axis}" in number:
-                    turn = about(axis, number[f"{joint}.{axis}"]) @ turn
+                    turn = rotation_about(axis, number[f"{joint}.{axis}"]) @ turn
             # From the axes of the object to those of the file, then of the parent.
             turn = upright.T @ turn @ upright
             parent = int(self.skeleton.parents[node])
@@ -346,7 +366,7 @@ class SkeletonRig:
             )
         return local_matrices
 
-    def _world(self, local_matrices: Tensor) -> Tensor:
+    def _compute_world(self, local_matrices: Tensor) -> Tensor:
         """Return the matrices (N, 4, 4) from nodes to the scene."""
         device = local_matrices.device
         world_by_level = list[Tensor]()
@@ -355,10 +375,10 @@ class SkeletonRig:
             if world_by_level:
                 matrices = world_by_level[-1][parent_rows.to(device)] @ matrices
             world_by_level.append(matrices)
-        return torch.cat(world_by_level)[self._back.to(device)]
+        return torch.cat(world_by_level)[self._node_order.to(device)]
 
 
-def _node_levels(parents: Ints) -> list[tuple[Tensor, Tensor]]:
+def _group_by_depth(parents: IntArray) -> list[tuple[Tensor, Tensor]]:
     """Group nodes by depth, so that those of one depth are computed at once.
 
     Args:
@@ -378,7 +398,7 @@ def _node_levels(parents: Ints) -> list[tuple[Tensor, Tensor]]:
     return levels
 
 
-def sampled(track: Track, seconds: Tensor) -> Tensor:
+def sample_track(track: Track, seconds: Tensor) -> Tensor:
     """Return the value (W,) of a track at a time (glTF 2.0, appendix C).
 
     Before its first key and after its last it is constant.
@@ -412,27 +432,28 @@ def sampled(track: Track, seconds: Tensor) -> Tensor:
     return first + fraction * (second - first)
 
 
-def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
+def slerp(first: Tensor, second: Tensor, fraction: Tensor) -> Tensor:
     """Interpolate between two rotations (4,) along the shorter arc.
 
-    `share` is 0 at the first and 1 at the second.
+    `fraction` is 0 at the first and 1 at the second.
     """
     first = first / first.norm()
     second = second / second.norm()
     cosine = first @ second
     second = torch.where(cosine < 0.0, -second, second)
     cosine = cosine.abs()
-    if float(cosine) > NEARLY_ONE:
-        chord: Tensor = first + share * (second - first)
+    if float(cosine) > MAX_ARC_COSINE:
+        chord: Tensor = first + fraction * (second - first)
         return chord.div(chord.norm())
     angle = torch.arccos(cosine)
     arc: Tensor = (
-        torch.sin((1.0 - share) * angle) * first + torch.sin(share * angle) * second
+        torch.sin((1.0 - fraction) * angle) * first
+        + torch.sin(fraction * angle) * second
     )
     return arc / torch.sin(angle)
 
 
-def rotation(quaternions: Tensor) -> Tensor:
+def quaternions_to_matrices(quaternions: Tensor) -> Tensor:
     """Return the rotations (N, 3, 3) of unit quaternions (N, 4), x, y, z, w."""
-    entries = entries_of_turn(*quaternions.unbind(dim=1))
+    entries = rotation_entries(*quaternions.unbind(dim=1))
     return torch.stack(entries, dim=1).reshape(-1, 3, 3)

@@ -50,7 +50,7 @@ class Parameter:
     estimators: tuple[str, ...] = ("differences",)
 
     # no quantity of a scene is larger; the square of one that is has no float32
-    LARGEST: ClassVar[float] = 1e30
+    MAX_VALUE: ClassVar[float] = 1e30
     GEOMETRIC: ClassVar[tuple[str, ...]] = ("secant", "differences", "material")
     """Valid estimators for what moves a mesh."""
     ORBIT: ClassVar[tuple[str, ...]] = ("secant", "differences")
@@ -67,7 +67,7 @@ class Parameter:
         No truth value, not NaN, and at most `LARGEST`.
         """
         is_real = isinstance(value, (int, float)) and not isinstance(value, bool)
-        return is_real and abs(value) <= Parameter.LARGEST  # type: ignore[arg-type]
+        return is_real and abs(value) <= Parameter.MAX_VALUE  # type: ignore[arg-type]
 
     @classmethod
     def number(
@@ -349,7 +349,7 @@ CAMERA = (
         estimators=("image",),
     ),
 )
-EV = Parameter(
+EXPOSURE_VALUE = Parameter(
     "ev",
     (),
     "EV at ISO 100",
@@ -360,7 +360,7 @@ EV = Parameter(
     "for lit streets.",
     estimators=(),
 )
-DROPS = (
+RAINDROPS = (
     Parameter(
         "drops",
         (),
@@ -465,10 +465,10 @@ GROUND_KINDS = (
     "lit-room",
     "snow-avenue",
 )
-ROADS = (DRY_ROAD, WET_ROAD)
-PLACES = (DRY_AVENUE, WET_AVENUE, SNOW_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM)
+ROAD_KINDS = (DRY_ROAD, WET_ROAD)
+PLACE_KINDS = (DRY_AVENUE, WET_AVENUE, SNOW_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM)
 # height above the floor of the camera of a photograph, where sizes are not known
-PHOTOGRAPHED_FROM = 3.0
+DEFAULT_PHOTOGRAPH_HEIGHT = 3.0
 # settings that only a table has
 TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
 GROUND = (
@@ -504,7 +504,7 @@ GROUND = (
         "metres",
         1e-3,
         1000.0,
-        f"1.6, or {PHOTOGRAPHED_FROM:g} object sizes",
+        f"1.6, or {DEFAULT_PHOTOGRAPH_HEIGHT:g} object sizes",
         "Height above the floor from which the photograph was taken; in object "
         "sizes as `camera.distance`.",
     ),
@@ -534,7 +534,12 @@ MATERIAL = (
     _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
 )
 FAMILIES = {
-    "camera": (*CAMERA, EV, *DROPS, _lamps("the car that the camera is in")),
+    "camera": (
+        *CAMERA,
+        EXPOSURE_VALUE,
+        *RAINDROPS,
+        _lamps("the car that the camera is in"),
+    ),
     "pose": POSE,
     "environment": ENVIRONMENT,
     "ground": GROUND,
@@ -549,23 +554,23 @@ SETTINGS: Mapping[str, Parameter] = {
 }
 """Every setting by `family.parameter`; of no other control's parameters."""
 # families that a scene has again for each mesh around the object: ``pose:chair.yaw``
-OF_A_MESH = ("pose", "material")
-# settings by name; `resolve` refuses what is no number
-Given = Mapping[str, float | str | Sequence[float]]
+MESH_FAMILIES = ("pose", "material")
+# settings by name; `resolve_settings` refuses what is no number
+SettingValues = Mapping[str, float | str | Sequence[float]]
 
 
-def parameter_of(name: str) -> Parameter | None:
+def find_parameter(name: str) -> Parameter | None:
     """Return the parameter that a setting's name means; None if there is none.
 
     Also for settings of a mesh around the object.
     """
     family, _, rest = name.partition(":")
-    if rest and family in OF_A_MESH:
+    if rest and family in MESH_FAMILIES:
         name = f"{family}.{rest.rpartition('.')[2]}"
     return SETTINGS.get(name)
 
 
-def mesh_of(name: str) -> str | None:
+def parse_mesh_name(name: str) -> str | None:
     """Return the mesh whose setting a name is: ``chair`` of ``pose:chair.yaw``.
 
     None for settings of the scene.
@@ -574,7 +579,7 @@ def mesh_of(name: str) -> str | None:
     return mesh if dot else None
 
 
-def resolve(given: Given) -> dict[str, float | None]:
+def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
     """Return every setting's value: the defaults, and over them what was given.
 
     None where the scene works a value out. Settings of meshes around the object are
@@ -584,7 +589,7 @@ def resolve(given: Given) -> dict[str, float | None]:
         InputError: a value is not a finite number inside its range.
         UnknownNameError: a name is not a setting.
     """
-    if "camera.elevation" in given and "camera.height" in given:
+    if "camera.elevation" in settings and "camera.height" in settings:
         raise InputError(
             "`set` camera.elevation and camera.height say the same thing; "
             "leave one of them out"
@@ -593,8 +598,8 @@ def resolve(given: Given) -> dict[str, float | None]:
         name: None if isinstance(parameter.default, str) else parameter.default
         for name, parameter in SETTINGS.items()
     }
-    for name, value in given.items():
-        setting = parameter_of(name)
+    for name, value in settings.items():
+        setting = find_parameter(name)
         if setting is None:
             raise UnknownNameError(
                 "scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE."

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles, Ints
+from advsearch.scene.assets import Float64Array, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,9 +19,9 @@ class Track:
     # "translation", "rotation" (x, y, z, w), "scale" or "weights" (of morph targets)
     path: str
     interpolation: str  # "LINEAR", "STEP" or "CUBICSPLINE"
-    times: Doubles  # (K,) seconds, rising
+    times: Float64Array  # (K,) seconds, rising
     # (K, 1, W); of a cubic spline (K, 3, W): in-tangent, value, out-tangent.
-    values: Doubles
+    values: Float64Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,23 +48,23 @@ class Skeleton:
 
     source: str  # name of the file, for messages
     names: tuple[str, ...]  # of the nodes, unique
-    parents: Ints  # (N,) parent of each node; -1 for a root
-    places: Doubles  # (N, 4, 4) matrices from each node to its parent
+    parents: IntArray  # (N,) parent of each node; -1 for a root
+    local_matrices: Float64Array  # (N, 4, 4) matrices from each node to its parent
     # The components of these matrices.
-    translations: Doubles  # (N, 3)
-    rotations: Doubles  # (N, 4)
-    scales: Doubles  # (N, 3)
-    fixed: np.ndarray  # (N,) whether a node has a matrix and no components
+    translations: Float64Array  # (N, 3)
+    rotations: Float64Array  # (N, 4)
+    scales: Float64Array  # (N, 3)
+    has_matrix: np.ndarray  # (N,) whether a node has a matrix and no components
     clips: tuple[Clip, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class MorphTarget:
     """A morph target."""
 
     name: str
-    rows: Ints  # (n,) the vertices that it moves
-    moves: Doubles  # (n, 3) how far it moves them
+    rows: IntArray  # (n,) the vertices that it moves
+    offsets: Float64Array  # (n, 3) how far it moves them
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,16 +73,18 @@ class Movable:
 
     skeleton: Skeleton  # of its file
     node: int  # index of the node that draws it
-    vertices: Doubles  # (V, 3) in the coordinates of its mesh
-    nodes: Ints  # (J,) nodes of the joints; its own node if it has no skin
-    inverse: Doubles  # (J, 4, 4) inverse bind matrices
-    joints: Ints  # (V, n) indices into `nodes`
-    weights: Doubles  # (V, n) of the joints; they sum to 1
-    targets: tuple[Target, ...]  # morph targets
-    rest: Doubles  # (T,) their weights at rest
+    vertices: Float64Array  # (V, 3) in the coordinates of its mesh
+    nodes: IntArray  # (J,) nodes of the joints; its own node if it has no skin
+    inverse_binds: Float64Array  # (J, 4, 4) inverse bind matrices
+    joints: IntArray  # (V, n) indices into `nodes`
+    weights: Float64Array  # (V, n) of the joints; they sum to 1
+    targets: tuple[MorphTarget, ...]  # morph targets
+    rest_weights: Float64Array  # (T,) their weights at rest
 
 
-def with_above(parents: Sequence[int] | Ints, nodes: Collection[int]) -> set[int]:
+def with_ancestors(
+    parents: Sequence[int] | IntArray, nodes: Collection[int]
+) -> set[int]:
     """Return nodes and all their ancestors.
 
     `parents` (N,) are the parents of all nodes, -1 for a root.
@@ -95,7 +97,7 @@ def with_above(parents: Sequence[int] | Ints, nodes: Collection[int]) -> set[int
     return reached
 
 
-def entries_of_turn(x: Any, y: Any, z: Any, w: Any) -> list[Any]:
+def rotation_entries(x: Any, y: Any, z: Any, w: Any) -> list[Any]:
     """Return the nine entries, row by row, of the rotation of a unit quaternion.
 
     Its real part is `w`.

@@ -14,35 +14,46 @@ import numpy as np
 import xatlas
 from scipy.sparse import coo_array
 
-from advsearch.scene.assets import Doubles, Ints, Mesh, face_vectors, grouped
-from advsearch.scene.importing.geometry import Soup, connected, neighbours, unit_vectors
+from advsearch.scene.assets import (
+    Float64Array,
+    IntArray,
+    Mesh,
+    compute_area_vectors,
+    group_indices,
+)
+from advsearch.scene.importing.geometry import (
+    Soup,
+    find_components,
+    find_shared_edges,
+    normalize_vectors,
+)
 from advsearch.scene.raster import (
     Charts,
-    doubled_areas,
-    pixels_in,
-    rasterised,
-    weights_at,
+    compute_barycentric,
+    compute_doubled_areas,
+    rasterize_charts,
+    rasterize_triangles,
 )
 
 ATLAS_SIZE = 512
 # texels between charts in an atlas of `ATLAS_SIZE`: two in a texture of half that size
 ATLAS_PADDING = 4
-_SCALE = 100.0  # xatlas takes faces under about 1e-7 square units for empty
+_XATLAS_SCALE = 100.0  # xatlas takes faces under about 1e-7 square units for empty
 # xatlas takes neighbours whose normals have a product over 1 - 1e-4 for one plane
-_FLUSH = 1.0 - 1.5e-4
+_MIN_FLUSH_COSINE = 1.0 - 1.5e-4
 # how far the normals of what it takes for a plane may stray before it matters
-_PLANE = np.cos(np.radians(10.0))
+_MIN_PLANE_COSINE = np.cos(np.radians(10.0))
 # faces that xatlas gets at a time, about; its time grows faster than their number
-_MANY = 20_000
-_LARGE = 200_000  # faces of a mesh above which that matters
-_PIECE = 1_500  # largest number of faces that xatlas then gets at a time
+_FACES_PER_ATLAS = 20_000
+_LARGE_MESH_FACES = 200_000  # faces of a mesh above which that matters
+_MAX_CELL_FACES = 1_500  # largest number of faces that xatlas then gets at a time
 # more are no surface but a heap of faces, and xatlas would take minutes over them
-_MOST_PATCHES = 10_000
+_MAX_PATCHES = 10_000
 # rounds of averaging normals, so that noise does not fray the borders of patches
-_SMOOTHING = 10
+_SMOOTHING_ROUNDS = 10
 
 
-def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
+def unwrap(soup: Soup, chart_group: IntArray | None = None) -> Soup:
     """Return a soup with texture coordinates from xatlas; deterministic.
 
     The charts do not overlap and lie inside the unit square. The faces of a mesh in
@@ -50,15 +61,15 @@ def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
 
     Args:
         soup: the faces.
-        apart: (F,) faces with different numbers get charts of their own.
+        chart_group: (F,) faces with different numbers get charts of their own.
     """
     patch = _find_patches(soup)
-    if apart is not None:
-        pairs = patch * (int(apart.max()) + 1) + apart
+    if chart_group is not None:
+        pairs = patch * (int(chart_group.max()) + 1) + chart_group
         patch = np.unique(pairs, return_inverse=True)[1].reshape(-1)
-    if int(patch.max()) >= _MOST_PATCHES:
-        return replace(soup, uvs=_grid_uvs(len(soup.faces)))
-    groups = grouped(patch)
+    if int(patch.max()) >= _MAX_PATCHES:
+        return replace(soup, uvs=_make_grid_uvs(len(soup.faces)))
+    groups = group_indices(patch)
     atlas = _generate_atlas(soup, groups)
     uvs = np.empty((len(soup.faces), 3, 2))
     for index, group in enumerate(groups):
@@ -69,7 +80,7 @@ def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
     return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(uvs, 0.0, 1.0))
 
 
-def _grid_uvs(count: int) -> Doubles:
+def _make_grid_uvs(count: int) -> Float64Array:
     """Return texture coordinates (count, 3, 2): two faces in each cell of a grid."""
     n_columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
     face = np.arange(count)
@@ -81,14 +92,14 @@ def _grid_uvs(count: int) -> Doubles:
     return np.asarray((cell_corner + in_cell) / n_columns)
 
 
-def _generate_atlas(soup: Soup, groups: Sequence[Ints]) -> xatlas.Atlas:
+def _generate_atlas(soup: Soup, groups: Sequence[IntArray]) -> xatlas.Atlas:
     """Unwrap groups of faces into one atlas, of `ATLAS_SIZE` if they fit into it."""
     for resolution in (ATLAS_SIZE, 0):  # 0: one atlas, however large
         atlas = xatlas.Atlas()
         for group in groups:
             used, corners = np.unique(soup.faces[group], return_inverse=True)
             atlas.add_mesh(
-                (soup.points[used] * _SCALE).astype(np.float32),
+                (soup.points[used] * _XATLAS_SCALE).astype(np.float32),
                 corners.reshape(-1, 3).astype(np.uint32),
             )
         options = xatlas.PackOptions()
@@ -100,7 +111,7 @@ def _generate_atlas(soup: Soup, groups: Sequence[Ints]) -> xatlas.Atlas:
     return atlas
 
 
-def _find_patches(soup: Soup) -> Ints:
+def _find_patches(soup: Soup) -> IntArray:
     """Cut a mesh that xatlas cannot unwrap well in one piece.
 
     xatlas 0.0.11 takes neighbouring faces that hardly bend for one plane. On a finely
@@ -112,33 +123,35 @@ def _find_patches(soup: Soup) -> Ints:
     Returns:
         The patch of each face (F,), numbered from 0.
     """
-    normals: Doubles = unit_vectors(soup.face_vectors())
+    normals: Float64Array = normalize_vectors(soup.face_vectors())
     count = len(normals)
-    left, right, _ = neighbours(soup.faces)
+    left, right, _ = find_shared_edges(soup.faces)
     face = left // 3
     neighbour = right // 3
-    is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _FLUSH
-    plane = connected(count, face[is_flush], neighbour[is_flush])
-    plane_sums: Doubles = np.stack(
+    is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
+    plane = find_components(count, face[is_flush], neighbour[is_flush])
+    plane_sums: Float64Array = np.stack(
         [np.bincount(plane, normals[:, axis]) for axis in range(3)], axis=1
     )
-    plane_normals = unit_vectors(plane_sums)[plane]
-    is_straight = (normals * plane_normals).sum(axis=1) > _PLANE
-    if is_straight.all() and count <= _MANY:
+    plane_normals = normalize_vectors(plane_sums)[plane]
+    is_straight = (normals * plane_normals).sum(axis=1) > _MIN_PLANE_COSINE
+    if is_straight.all() and count <= _FACES_PER_ATLAS:
         return np.zeros(count, dtype=np.int64)
 
     smoothed = _smooth_normals(normals, face, neighbour)
-    direction = (smoothed @ _cut_directions().T).argmax(axis=1)
+    direction = (smoothed @ _make_cut_directions().T).argmax(axis=1)
     is_same = direction[face] == direction[neighbour]
-    patch = connected(count, face[is_same], neighbour[is_same])
-    if count <= _LARGE:
+    patch = find_components(count, face[is_same], neighbour[is_same])
+    if count <= _LARGE_MESH_FACES:
         return patch
     cell = _halve_patches(soup.points[soup.faces].mean(axis=1), patch)
     is_same &= cell[face] == cell[neighbour]
-    return connected(count, face[is_same], neighbour[is_same])
+    return find_components(count, face[is_same], neighbour[is_same])
 
 
-def _smooth_normals(normals: Doubles, face: Ints, neighbour: Ints) -> Doubles:
+def _smooth_normals(
+    normals: Float64Array, face: IntArray, neighbour: IntArray
+) -> Float64Array:
     """Average the normals of faces with their neighbours', in several rounds."""
     count = len(normals)
     itself = np.arange(count)
@@ -147,19 +160,19 @@ def _smooth_normals(normals: Doubles, face: Ints, neighbour: Ints) -> Doubles:
     average = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
     average = average.tocsr()
     smoothed = normals
-    for _ in range(_SMOOTHING):
-        smoothed = np.nan_to_num(unit_vectors(average @ smoothed))
+    for _ in range(_SMOOTHING_ROUNDS):
+        smoothed = np.nan_to_num(normalize_vectors(average @ smoothed))
     return smoothed
 
 
-def _cut_directions() -> Doubles:
+def _make_cut_directions() -> Float64Array:
     """Return the 14 unit directions of a cube's faces and corners."""
     faces = np.concatenate([np.eye(3), -np.eye(3)])
     corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
     return np.concatenate([faces, corners / np.sqrt(3.0)])
 
 
-def _halve_patches(centers: Doubles, patch: Ints) -> Ints:
+def _halve_patches(centers: Float64Array, patch: IntArray) -> IntArray:
     """Halve patches (F,) until they are small.
 
     Returns:
@@ -167,10 +180,10 @@ def _halve_patches(centers: Doubles, patch: Ints) -> Ints:
     """
     cell = np.zeros(len(patch), dtype=np.int64)
     count = 0
-    remaining = grouped(patch)
+    remaining = group_indices(patch)
     while remaining:
         group = remaining.pop()
-        if len(group) > _PIECE:
+        if len(group) > _MAX_CELL_FACES:
             axis = np.ptp(centers[group], axis=0).argmax()
             order = group[np.argsort(centers[group, axis], kind="stable")]
             middle = len(order) // 2
@@ -181,15 +194,19 @@ def _halve_patches(centers: Doubles, patch: Ints) -> Ints:
     return cell
 
 
-CELLS = 64  # cells along each side of the map
+MAP_SIZE = 64  # cells along each side of the map
 # of a mesh, which are counted one by one; smaller ones cannot be distinguished in an
 # image
-MOST_FACES = 20_000
+MAX_FACES = 20_000
 # fraction of the map that charts may cover twice before the mesh is unwrapped anew
-DOUBLED = 0.01
-FLAT = 0.05  # fraction of the surface that may have no area on the map, likewise
-COVERED = 0.02  # fraction of the unit square that charts have to cover, likewise
-_FINE = 256  # width of the raster in which charts are compared
+MAX_DOUBLED_FRACTION = 0.01
+MAX_FLAT_FRACTION = (
+    0.05  # fraction of the surface that may have no area on the map, likewise
+)
+MIN_COVERED_FRACTION = (
+    0.02  # fraction of the unit square that charts have to cover, likewise
+)
+_TEST_RASTER_SIZE = 256  # width of the raster in which charts are compared
 
 
 class SurfaceParts:
@@ -197,64 +214,68 @@ class SurfaceParts:
 
     Attributes:
         mesh: with texture coordinates of any kind.
-        unwrapped: whether the map is not that of the mesh's own texture coordinates.
+        is_unwrapped: whether the map is not that of the mesh's own texture coordinates.
         corners: (F, 3, 2) where each face lies on the map, in [0, 1]; v = 0 is the
             bottom.
-        by_face: whether the faces are parts too.
+        counts_faces: whether the faces are parts too.
         count: number of parts: cells, row by row from v = 1, and then the faces.
-        covered: (CELLS, CELLS) whether the center of a cell lies in a chart.
+        is_covered: (CELLS, CELLS) whether the center of a cell lies in a chart.
         face: (count,) the face at the center of each part; of a cell outside of all
             charts the nearest one.
-        place: (count, 3) that center, in the mesh's coordinates.
-        at: (count, 2) and its u and v.
+        centers: (count, 3) that center, in the mesh's coordinates.
+        center_uvs: (count, 2) and its u and v.
     """
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self._mesh_uvs = mesh.uvs[mesh.faces].astype(np.float64)
-        self.unwrapped = not _is_one_to_one(mesh, self._mesh_uvs)
-        self.corners = _unwrap_mesh(mesh) if self.unwrapped else self._mesh_uvs
+        self.is_unwrapped = not _has_unique_uvs(mesh, self._mesh_uvs)
+        self.corners = _unwrap_mesh(mesh) if self.is_unwrapped else self._mesh_uvs
         charts = _rasterise_map(mesh, self.corners)
-        self.by_face = len(mesh.faces) <= MOST_FACES
-        faces = np.arange(len(mesh.faces) if self.by_face else 0)
-        self.count = CELLS * CELLS + len(faces)
-        self.covered = charts.covered
+        self.counts_faces = len(mesh.faces) <= MAX_FACES
+        faces = np.arange(len(mesh.faces) if self.counts_faces else 0)
+        self.count = MAP_SIZE * MAP_SIZE + len(faces)
+        self.is_covered = charts.is_covered
         self.face = np.concatenate([charts.face.reshape(-1), faces])
         face_centers = mesh.vertices[mesh.faces[faces]].mean(axis=1)
-        centers = np.concatenate([charts.positions().reshape(-1, 3), face_centers])
-        self.place = centers.astype(np.float64)
-        row, column = np.divmod(np.arange(CELLS * CELLS), CELLS)
-        cell_uvs = np.stack([(column + 0.5) / CELLS, 1.0 - (row + 0.5) / CELLS], axis=1)
-        self.at = np.concatenate([cell_uvs, self.corners[faces].mean(axis=1)])
+        centers = np.concatenate(
+            [charts.compute_positions().reshape(-1, 3), face_centers]
+        )
+        self.centers = centers.astype(np.float64)
+        row, column = np.divmod(np.arange(MAP_SIZE * MAP_SIZE), MAP_SIZE)
+        cell_uvs = np.stack(
+            [(column + 0.5) / MAP_SIZE, 1.0 - (row + 0.5) / MAP_SIZE], axis=1
+        )
+        self.center_uvs = np.concatenate([cell_uvs, self.corners[faces].mean(axis=1)])
 
     @property
-    def kinds(self) -> dict[str, slice]:
+    def part_slices(self) -> dict[str, slice]:
         """Which of the parts are cells, and which are faces."""
-        kinds = {"cell": slice(0, CELLS * CELLS)}
-        if self.by_face:
-            kinds["face"] = slice(CELLS * CELLS, self.count)
+        kinds = {"cell": slice(0, MAP_SIZE * MAP_SIZE)}
+        if self.counts_faces:
+            kinds["face"] = slice(MAP_SIZE * MAP_SIZE, self.count)
         return kinds
 
-    def cells(self, face: Ints, uv: Doubles) -> Ints:
+    def find_cells(self, face: IntArray, uv: Float64Array) -> IntArray:
         """Return the cells (n,) of points on faces.
 
         Args:
             face: (n,) index of the face.
             uv: (n, 2) the mesh's own texture coordinates.
         """
-        if self.unwrapped:
+        if self.is_unwrapped:
             # rows run along v here
-            weights = weights_at(self._mesh_uvs[face], uv[:, 1], uv[:, 0])
+            weights = compute_barycentric(self._mesh_uvs[face], uv[:, 1], uv[:, 0])
             weights = np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3)
             weights = np.clip(weights, 0.0, 1.0)
             weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
             uv = np.einsum("nk,nkc->nc", weights, self.corners[face])
-        cells = np.floor(np.stack([uv[:, 0], 1 - uv[:, 1]]) * CELLS)
-        column, row = np.clip(cells, 0, CELLS - 1).astype(np.int64)
-        return np.asarray(row * CELLS + column)
+        cells = np.floor(np.stack([uv[:, 0], 1 - uv[:, 1]]) * MAP_SIZE)
+        column, row = np.clip(cells, 0, MAP_SIZE - 1).astype(np.int64)
+        return np.asarray(row * MAP_SIZE + column)
 
 
-def _unwrap_mesh(mesh: Mesh) -> Doubles:
+def _unwrap_mesh(mesh: Mesh) -> Float64Array:
     """Return new texture coordinates (F, 3, 2) of a mesh that do not overlap."""
     lower = mesh.vertices.min(axis=0)
     upper = mesh.vertices.max(axis=0)
@@ -272,28 +293,35 @@ def _unwrap_mesh(mesh: Mesh) -> Doubles:
         unknown[..., :2],
         np.ones_like(unknown),
     )
-    return unwrapped(soup).uvs
+    return unwrap(soup).uvs
 
 
-def _rasterise_map(mesh: Mesh, uvs: Doubles) -> Charts:
+def _rasterise_map(mesh: Mesh, uvs: Float64Array) -> Charts:
     """Rasterise texture coordinates (F, 3, 2) of a mesh's faces into the map's cells."""
     vertex = mesh.faces.reshape(-1)
     faces = np.arange(len(vertex), dtype=np.uint32).reshape(-1, 3)
     flat_uvs = uvs.reshape(-1, 2).astype(np.float32)
     separate = Mesh(mesh.vertices[vertex], faces, mesh.normals[vertex], flat_uvs)
-    return rasterised(separate, CELLS)
+    return rasterize_charts(separate, MAP_SIZE)
 
 
-def _is_one_to_one(mesh: Mesh, uvs: Doubles) -> bool:
+def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
     """Return whether texture coordinates (F, 3, 2) tell points of a surface apart."""
     if uvs.min() < 0.0 or uvs.max() > 1.0:
         return False
     corners = mesh.vertices[mesh.faces].astype(np.float64)
-    areas = np.linalg.norm(face_vectors(corners), axis=1)
-    is_flat = np.abs(doubled_areas(uvs)) < 1e-12
-    if areas[is_flat].sum() > FLAT * areas.sum():
+    areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
+    is_flat = np.abs(compute_doubled_areas(uvs)) < 1e-12
+    if areas[is_flat].sum() > MAX_FLAT_FRACTION * areas.sum():
         return False
-    _, row, column, _ = pixels_in(uvs * _FINE - 0.5, (_FINE, _FINE), tolerance=-1e-6)
-    covered = len(np.unique(row * _FINE + column))
+    _, row, column, _ = rasterize_triangles(
+        uvs * _TEST_RASTER_SIZE - 0.5,
+        (_TEST_RASTER_SIZE, _TEST_RASTER_SIZE),
+        tolerance=-1e-6,
+    )
+    covered = len(np.unique(row * _TEST_RASTER_SIZE + column))
     doubled = len(row) - covered
-    return covered >= COVERED * _FINE**2 and doubled <= DOUBLED * covered
+    return (
+        covered >= MIN_COVERED_FRACTION * _TEST_RASTER_SIZE**2
+        and doubled <= MAX_DOUBLED_FRACTION * covered
+    )

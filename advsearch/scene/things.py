@@ -21,39 +21,52 @@ import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import (
-    LARGEST,
-    SMALLEST,
-    Doubles,
+    MAX_METRES,
+    MIN_METRES,
+    Float64Array,
     ObjectAsset,
-    doubts,
-    footing,
-    pose_of,
-    sized,
+    describe_size_doubts,
+    find_footing,
+    make_pose,
+    with_size,
 )
-from advsearch.scene.geometry import footprint, middle, overlapping, rotation, standing
+from advsearch.scene.geometry import (
+    compute_base_vertices,
+    compute_center,
+    compute_footprint,
+    is_overlapping,
+    make_rotation,
+)
 from advsearch.scene.grounds import has_lanes
-from advsearch.scene.importing.files import safe_name
-from advsearch.scene.parts import Footprint, MeshPart, mesh_part
+from advsearch.scene.importing.files import make_safe_name
+from advsearch.scene.parts import Footprint, MeshPart, make_mesh_part
 from advsearch.scene.settings import LAMPS
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
-FARTHEST = 1000.0  # how far from the object a thing may stand, metres
-MOST = 64  # things beside an object
+MAX_DISTANCE = 1000.0  # how far from the object a thing may stand, metres
+MAX_THINGS = 64  # things beside an object
 EYE_SIZE = 1e-3  # half the width of what stands for a camera, object sizes
 OPTIONS = ("heading", "size", "name", "label", "lamps", "facing")
-LAID = ("road", "floor")  # what the ground of a bundled place is called
-ALL = "all"  # what stands for the object and every thing beside it
+GROUND_NAMES = ("road", "floor")  # what the ground of a bundled place is called
+ALL_THINGS = "all"  # what stands for the object and every thing beside it
 # what a thing can't be called
-TAKEN = ("object", "environment", "ground", "camera", *LAID, ALL)
+RESERVED_NAMES = (
+    "object",
+    "environment",
+    "ground",
+    "camera",
+    *GROUND_NAMES,
+    ALL_THINGS,
+)
 
 
 @dataclass(frozen=True)
-class AskedThing:
+class RequestedThing:
     """A thing as it is asked for."""
 
-    what: str  # a bundled object, or a mesh file
+    object_spec: str  # a bundled object, or a mesh file
     x: float  # metres
     y: float
     heading: float = 0.0  # degrees
@@ -74,12 +87,12 @@ class ThingPart(MeshPart):
     lamps: str = LAMPS[0]  # which it has on
 
 
-def asked_things(text: str | None) -> tuple[AskedThing, ...]:
+def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
     """Read the things of a setting, see above. Raises InputError: it is invalid."""
-    things: list[AskedThing] = []
-    for part in filter(None, map(str.strip, (text or "").split(";"))):
+    things: list[RequestedThing] = []
+    for part in filter(None, map(str.strip, (things_spec or "").split(";"))):
         thing = _parse_thing(part)
-        reserved = [*TAKEN, *(other.name for other in things)]
+        reserved = [*RESERVED_NAMES, *(other.name for other in things)]
         if thing.name in reserved and "name=" in part:
             raise InputError(
                 f"things: {part}: another thing of the scene is called "
@@ -92,12 +105,12 @@ def asked_things(text: str | None) -> tuple[AskedThing, ...]:
             )
             suffix += 1
         things.append(thing)
-    if len(things) > MOST:
-        raise InputError(f"things: expected at most {MOST}, got {len(things)}")
+    if len(things) > MAX_THINGS:
+        raise InputError(f"things: expected at most {MAX_THINGS}, got {len(things)}")
     return tuple(things)
 
 
-def _parse_thing(part: str) -> AskedThing:
+def _parse_thing(part: str) -> RequestedThing:
     """Read one thing.
 
     Raises InputError, UnknownNameError: it is not as described above.
@@ -122,7 +135,7 @@ def _parse_thing(part: str) -> AskedThing:
     if lamps not in LAMPS:
         raise UnknownNameError(f"lamps of things {part!r}:", lamps, LAMPS)
     x, y = (
-        _parse_number(part, name, word, -FARTHEST, FARTHEST)
+        _parse_number(part, name, word, -MAX_DISTANCE, MAX_DISTANCE)
         for name, word in zip("xy", fields, strict=False)
     )
     heading = (
@@ -131,12 +144,14 @@ def _parse_thing(part: str) -> AskedThing:
         else 0.0
     )
     size = (
-        _parse_number(part, "size", options["size"], SMALLEST, LARGEST)
+        _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
         if "size" in options
         else None
     )
-    name = safe_name(Path(options.get("name") or object_spec.strip().partition("#")[0]))
-    return AskedThing(
+    name = make_safe_name(
+        Path(options.get("name") or object_spec.strip().partition("#")[0])
+    )
+    return RequestedThing(
         object_spec.strip(),
         x,
         y,
@@ -163,16 +178,16 @@ def _parse_number(part: str, name: str, text: str, low: float, high: float) -> f
     return value
 
 
-def with_things(
+def add_things(
     scene: SceneDescription,
-    text: str | None,
+    things_spec: str | None,
     load: Callable[[str, str | None], ObjectAsset],
 ) -> SceneDescription:
     """Return the scene with the things beside its object that a setting names.
 
     Args:
         scene: with the object.
-        text: the setting; None for no things.
+        things_spec: the setting; None for no things.
         load: loads an object by its name or file, and the axis that its front
             faces.
 
@@ -181,7 +196,7 @@ def with_things(
             known.
         UnknownNameError: there is no such object.
     """
-    requested = asked_things(text)
+    requested = parse_things(things_spec)
     if not requested:
         return scene
     if scene.object.metres is None:
@@ -193,9 +208,9 @@ def with_things(
     parts = list[ThingPart]()
     remarks = list[str]()
     for thing in requested:
-        object_spec = thing.what
+        object_spec = thing.object_spec
         name = thing.name
-        asset = sized(load(object_spec, thing.facing), thing.size, None)
+        asset = with_size(load(object_spec, thing.facing), thing.size, None)
         if asset.metres is None:
             example = f"{object_spec}@{thing.x:g},{thing.y:g},size=METRES"
             raise InputError(
@@ -206,7 +221,7 @@ def with_things(
                 f"things: something of the scene is called {name} "
                 "already; add name=NAME to it"
             )
-        part = mesh_part(
+        part = make_mesh_part(
             name,
             asset,
             _compute_pose(scene, asset, thing, asset.metres),
@@ -216,13 +231,15 @@ def with_things(
         parts.append(ThingPart(**fields, metres=asset.metres, lamps=thing.lamps))
         remarks += [
             *asset.notes,
-            *doubts(asset, asked=thing.size is not None, laid=True),
+            *describe_size_doubts(
+                asset, has_user_size=thing.size is not None, needs_metres=True
+            ),
         ]
         if asset.front is not None and asset.front.reason and has_lanes(scene):
             remarks.append(asset.front.reason)
-    scene = replace(scene, parts=(*scene.parts, *parts), things_spec=text or "")
-    footprints = {"the object": footprint(scene.base_vertices)} | {
-        name: footprint(standing(part))
+    scene = replace(scene, parts=(*scene.parts, *parts), things_spec=things_spec or "")
+    footprints = {"the object": compute_footprint(scene.base_vertices)} | {
+        name: compute_footprint(compute_base_vertices(part))
         for name, part in scene.meshes.items()
         if isinstance(part, ThingPart)
     }
@@ -230,41 +247,53 @@ def with_things(
         f"{first[0].upper()}{first[1:]} and {other} stand in each other: their "
         "outlines on the ground overlap."
         for first, other in combinations(footprints, 2)
-        if overlapping(footprints[first], footprints[other])
+        if is_overlapping(footprints[first], footprints[other])
     ]
     return replace(scene, remarks=(*scene.remarks, *remarks))
 
 
 def _compute_pose(
-    scene: SceneDescription, asset: ObjectAsset, requested: AskedThing, metres: float
-) -> Doubles:
-    foot, extent = footing(asset.mesh.vertices.astype(np.float64))
-    linear = metres / scene.metres / extent * rotation(requested.heading, 0.0, 0.0)
-    position = middle(scene)[:2] + np.array([requested.x, requested.y]) / scene.metres
-    return pose_of(
-        linear, np.array([*position, ground_height(scene, position)]) - linear @ foot
+    scene: SceneDescription,
+    asset: ObjectAsset,
+    requested: RequestedThing,
+    metres: float,
+) -> Float64Array:
+    foot, extent = find_footing(asset.mesh.vertices.astype(np.float64))
+    linear = metres / scene.metres / extent * make_rotation(requested.heading, 0.0, 0.0)
+    position = (
+        compute_center(scene)[:2] + np.array([requested.x, requested.y]) / scene.metres
+    )
+    return make_pose(
+        linear,
+        np.array([*position, find_ground_height(scene, position)]) - linear @ foot,
     )
 
 
-def ground_height(scene: SceneDescription, place: Doubles) -> float:
+def find_ground_height(scene: SceneDescription, position: Float64Array) -> float:
     """Return how high the ground lies at a position (2,), object sizes.
 
     That is the height of the road, the pavement, the table or the floor; or 0.
     """
-    ground = (part for part in scene.around.values() if part.is_ground)
-    triangles = (standing(part)[part.mesh.faces.astype(np.int64)] for part in ground)
+    ground = (part for part in scene.surrounding_meshes.values() if part.is_ground)
+    triangles = (
+        compute_base_vertices(part)[part.mesh.faces.astype(np.int64)] for part in ground
+    )
     return max(
-        (height for corners in triangles for height in heights_over(corners, place)),
+        (
+            height
+            for corners in triangles
+            for height in find_triangle_heights(corners, position)
+        ),
         default=0.0,
     )
 
 
-def heights_over(corners: Doubles, place: Doubles) -> list[float]:
+def find_triangle_heights(corners: Float64Array, position: Float64Array) -> list[float]:
     """Return the heights of triangles (F, 3 corners, 3) above or below a point (2,)."""
     a, b, c = np.moveaxis(corners, 1, 0)
     doubled_areas = [
-        (end[:, 0] - begin[:, 0]) * (place[1] - begin[:, 1])
-        - (end[:, 1] - begin[:, 1]) * (place[0] - begin[:, 0])
+        (end[:, 0] - begin[:, 0]) * (position[1] - begin[:, 1])
+        - (end[:, 1] - begin[:, 1]) * (position[0] - begin[:, 0])
         for begin, end in ((b, c), (c, a), (a, b))
     ]
     total_area = doubled_areas[0] + doubled_areas[1] + doubled_areas[2]
@@ -278,29 +307,30 @@ def heights_over(corners: Doubles, place: Doubles) -> list[float]:
     return heights
 
 
-def solid_at(scene: SceneDescription, taken: Footprint) -> str | None:
+def find_overlapping_solid(scene: SceneDescription, footprint: Footprint) -> str | None:
     """Return the solid of the scene that a footprint overlaps, such as "a house".
 
     None where it stands free.
     """
-    for part in scene.around.values():
+    for part in scene.surrounding_meshes.values():
         for solid in part.solids:
-            if overlapping(solid.footprint, taken):
+            if is_overlapping(solid.footprint, footprint):
                 return solid.name
     return None
 
 
-def with_solids_checked(scene: SceneDescription) -> SceneDescription:
+def add_solid_remarks(scene: SceneDescription) -> SceneDescription:
     """Return the scene with a remark on its object and each thing inside a solid."""
-    if not any(part.solids for part in scene.around.values()):
+    if not any(part.solids for part in scene.surrounding_meshes.values()):
         return scene
-    footprints = {"the object": footprint(scene.base_vertices)}
+    footprints = {"the object": compute_footprint(scene.base_vertices)}
     footprints |= {
-        name: footprint(standing(scene.meshes[name])) for name in scene.things
+        name: compute_footprint(compute_base_vertices(scene.meshes[name]))
+        for name in scene.things
     }
     remarks = list[str]()
     for name, outline in footprints.items():
-        solid = solid_at(scene, outline)
+        solid = find_overlapping_solid(scene, outline)
         if solid is not None:
             remarks.append(
                 f"{name[0].upper()}{name[1:]} stands in {solid} of the "
@@ -309,7 +339,9 @@ def with_solids_checked(scene: SceneDescription) -> SceneDescription:
     return replace(scene, remarks=(*scene.remarks, *remarks))
 
 
-def camera_remarks(scene: SceneDescription, eyes: Sequence[Doubles]) -> tuple[str, ...]:
+def list_camera_remarks(
+    scene: SceneDescription, eyes: Sequence[Float64Array]
+) -> tuple[str, ...]:
     """Return a remark where cameras, at positions (3,) in metres, are inside a solid."""
     inside = list[str]()
     for eye in eyes:
@@ -317,7 +349,9 @@ def camera_remarks(scene: SceneDescription, eyes: Sequence[Doubles]) -> tuple[st
         around = np.array(
             [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]
         )
-        solid = solid_at(scene, Footprint(around, z - EYE_SIZE, z + EYE_SIZE))
+        solid = find_overlapping_solid(
+            scene, Footprint(around, z - EYE_SIZE, z + EYE_SIZE)
+        )
         if solid is not None:
             inside.append(solid)
     if not inside:

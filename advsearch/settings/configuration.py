@@ -135,7 +135,7 @@ def setting(
 
 
 # Fields of a `Setting` that `settings` completes.
-WORKED_OUT = ("field", "name", "required", "is_switch", "is_mapping")
+DERIVED_FIELDS = ("field", "name", "required", "is_switch", "is_mapping")
 
 
 def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
@@ -144,7 +144,7 @@ def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
     declared = {
         name: value
         for name, value in vars(extra["declared"]).items()
-        if name not in WORKED_OUT
+        if name not in DERIVED_FIELDS
     }
     return setting(**{**declared, **extra["constraints"], **changes})
 
@@ -183,7 +183,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
                 required=info.is_required(),
                 default=default,
                 flag=declared.flag or "--" + field.replace("_", "-"),
-                expects=declared.expects or _expected(info),
+                expects=declared.expects or _describe_expected(info),
                 metavar=declared.metavar or field.rpartition("_")[2].upper(),
                 repeats=declared.repeats or is_mapping,
                 is_switch=info.annotation is bool,
@@ -193,7 +193,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
     return tuple(completed)
 
 
-def _expected(info: FieldInfo) -> str:
+def _describe_expected(info: FieldInfo) -> str:
     """Describe the values of a field by its type and constraints."""
     types = [
         value_type
@@ -226,7 +226,7 @@ def _join_choices(choices: Sequence[Any]) -> str:
     return f"{', '.join(first)} or {last}"
 
 
-PLACE: Mapping[str, bool | None] = {"run": None, "overwrite": False}
+RUN_LOCATION: Mapping[str, bool | None] = {"run": None, "overwrite": False}
 """Settings of where a run is stored, not of what it does, with the values that a
 repetition has.
 """
@@ -282,9 +282,9 @@ class Config(BaseModel):
     without: ClassVar[tuple[str, ...]] = ()
     clashes: ClassVar[tuple[Clash, ...]] = ()
     # they decide no number: they may change before a run goes on
-    free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")
+    free: ClassVar[tuple[str, ...]] = (*RUN_LOCATION, "threads")
 
-    _only_here: tuple[PythonOnly, ...] = PrivateAttr(())
+    _python_only_parts: tuple[PythonOnly, ...] = PrivateAttr(())
     _python_objects: dict[tuple[str, str], Any] = PrivateAttr(default_factory=dict)
     _left_out: tuple[LeftOut, ...] = PrivateAttr(())
 
@@ -294,12 +294,14 @@ class Config(BaseModel):
 
     def __init__(self, **data: Any) -> None:
         _check_shallow(type(self), data)
-        values = _mappings_from_texts(type(self), written.as_python(data))
+        values = _read_mappings(type(self), written.to_python(data))
         _check_shallow(type(self), values)
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise _settings_error(type(self), error.errors(include_url=False)) from None
+            raise _make_settings_error(
+                type(self), error.errors(include_url=False)
+            ) from None
 
     @field_validator("*", mode="before")
     @classmethod
@@ -315,7 +317,7 @@ class Config(BaseModel):
     @field_validator("*")
     @classmethod
     def _finite(cls, value: Any) -> Any:
-        if not written.all_finite(value):
+        if not written.are_all_finite(value):
             raise ValueError("not finite")
         return value
 
@@ -361,7 +363,7 @@ class Config(BaseModel):
         data.pop("schema", None)  # checked by `read_yaml`
         overrides = overrides or {}
         for name, value in overrides.items():
-            written.put(data, name, value)
+            written.set_dotted(data, name, value)
         try:
             left_out = [
                 power for power in cls(**data).powers if power.name not in overrides
@@ -394,7 +396,7 @@ class Config(BaseModel):
         return self._left_out
 
     @property
-    def asked(self) -> dict[str, Any]:
+    def session_settings(self) -> dict[str, Any]:
         """The settings of this session that may have such power and decide no number, which parts
         of a run get too.
         """
@@ -403,7 +405,7 @@ class Config(BaseModel):
             for setting in settings(type(self))
             if setting.power is not none
             and setting.name in self.free
-            and setting.name not in PLACE
+            and setting.name not in RUN_LOCATION
         }
 
     def check_powers(self, where: str) -> None:
@@ -417,7 +419,7 @@ class Config(BaseModel):
             )
 
     @classmethod
-    def shared(cls, other: Config) -> dict[str, object]:
+    def get_shared_settings(cls, other: Config) -> dict[str, object]:
         """Return the settings of another configuration that this command shares with it.
 
         They are those of the most specific common class, except for where the run is
@@ -428,7 +430,7 @@ class Config(BaseModel):
             for base in cls.__mro__
             if issubclass(base, Config) and isinstance(other, base)
         )
-        excluded = (*PLACE, "workers", "cluster", *cls.without, *other.without)
+        excluded = (*RUN_LOCATION, "workers", "cluster", *cls.without, *other.without)
         return {
             name: getattr(other, name)
             for name in common_class.model_fields
@@ -436,21 +438,23 @@ class Config(BaseModel):
         }
 
     @classmethod
-    def of(cls, other: Config, **changes: object) -> Self:
+    def from_config(cls, other: Config, **changes: object) -> Self:
         """Create a configuration of this command from that of another: the settings that are
         `shared`, and the changes.
         """
-        return cls(**{**cls.shared(other), **changes}).with_python_parts_of(other)
+        return cls(
+            **{**cls.get_shared_settings(other), **changes}
+        ).with_python_parts_of(other)
 
     @property
-    def only_here(self) -> tuple[PythonOnly, ...]:
+    def python_only_parts(self) -> tuple[PythonOnly, ...]:
         """The parts that exist only in this Python session."""
-        return self._only_here
+        return self._python_only_parts
 
-    def with_only_here(self, parts: Sequence[PythonOnly]) -> Self:
+    def with_python_only_parts(self, parts: Sequence[PythonOnly]) -> Self:
         """Return a copy with other parts that exist only in this Python session."""
         copy = self.model_copy()
-        copy._only_here = tuple(parts)
+        copy._python_only_parts = tuple(parts)
         return copy
 
     def python_object(self, role: str, name: str) -> Any:
@@ -475,7 +479,7 @@ class Config(BaseModel):
         """Return a copy with the objects of other settings, and with their parts that
         exist only in this session.
         """
-        return self.with_only_here(other.only_here).with_python_objects(
+        return self.with_python_only_parts(other.python_only_parts).with_python_objects(
             other._python_objects
         )
 
@@ -484,27 +488,27 @@ class Config(BaseModel):
 
         `from_yaml` of it gives an equal configuration, unless there are `powers` in it.
         """
-        data = {"schema": written.SCHEMA, "command": self.command, **self.plain()}
+        data = {"schema": written.SCHEMA, "command": self.command, **self.to_json()}
         note = ""
-        if self._only_here:
-            note = f"# But it can't be: {python_only_text(self.python_only)}\n"
+        if self._python_only_parts:
+            note = f"# But it can't be: {format_python_only(self.python_only)}\n"
         return written.HEADER + note + str(yaml.safe_dump(data, sort_keys=False))
 
-    def plain(self) -> JsonObject:
+    def to_json(self) -> JsonObject:
         """Return every setting by the name it has in YAML, as JSON values."""
         return self.model_dump(by_alias=True, mode="json")
 
     @property
-    def place(self) -> tuple[str | None, bool]:
+    def run_location(self) -> tuple[str | None, bool]:
         """Where the run is stored, None if that is not set, and whether a run there is replaced."""
         return getattr(self, "run", None), getattr(self, "overwrite", False)
 
     @property
-    def title(self) -> tuple[str, ...]:
+    def title_words(self) -> tuple[str, ...]:
         """The words from which a run without a stated place is named."""
         return (self.command,)
 
-    def to_repeat(self) -> Self:
+    def make_repeatable(self) -> Self:
         """Return what `run.yaml` stores: files by absolute path, and no place of the run,
         because a repetition gets its own.
         """
@@ -512,33 +516,39 @@ class Config(BaseModel):
         for name in FILES:
             value = getattr(self, name, None)
             if value is not None:
-                absolute[name] = ",".join(map(_absolute, written.split_names(value)))
-        return self.model_copy(update={**absolute, **PLACE})
+                absolute[name] = ",".join(
+                    map(_make_absolute, written.split_names(value))
+                )
+        return self.model_copy(update={**absolute, **RUN_LOCATION})
 
     def command_line(self, run: str | Path | None) -> str | None:
         """Return the shell command that repeats the run in a directory; None if there is none."""
-        if run is None or self._only_here:
+        if run is None or self._python_only_parts:
             return None
         return shlex.join(["advsearch", "run", str(Path(run) / written.CONFIG)])
 
     @property
     def python_only(self) -> list[str]:
         """The parts that exist only in this Python session, in words."""
-        return [part.text for part in self._only_here]
+        return [part.text for part in self._python_only_parts]
 
-    def deciding(self) -> JsonObject:
+    def get_deciding_settings(self) -> JsonObject:
         """Return the settings that decide a run's numbers, as JSON values: all that are not
         `free`.
 
         Files have their names only, because they may have been moved.
         """
         values = {
-            name: value for name, value in self.plain().items() if name not in self.free
+            name: value
+            for name, value in self.to_json().items()
+            if name not in self.free
         }
         for name in FILES:
             value = values.get(name)
             if isinstance(value, str):
-                names = [_file_names(entry) for entry in written.split_names(value)]
+                names = [
+                    _strip_directories(entry) for entry in written.split_names(value)
+                ]
                 values[name] = ",".join(names)
         return values
 
@@ -551,12 +561,10 @@ def _check_shallow(config: type[Config], data: Mapping[str, Any]) -> None:
         if not is_shallow(value)
     ]
     if problems:
-        raise _settings_error(config, problems)
+        raise _make_settings_error(config, problems)
 
 
-def _mappings_from_texts(
-    config: type[Config], data: Mapping[str, Any]
-) -> dict[str, Any]:
+def _read_mappings(config: type[Config], data: Mapping[str, Any]) -> dict[str, Any]:
     """Return values of settings, with mappings read from a text or several texts."""
     values = dict(data)
     for setting in settings(config):
@@ -574,13 +582,13 @@ def _mappings_from_texts(
             except ValueError:
                 got = texts[0] if len(texts) == 1 else texts
                 problem = {"loc": (name,), "input": got, "type": ""}
-                raise _settings_error(config, [problem]) from None
+                raise _make_settings_error(config, [problem]) from None
     return values
 
 
-def python_only_text(parts: Sequence[str]) -> str:
+def format_python_only(parts: Sequence[str]) -> str:
     """Return why no command repeats a run with parts that exist only in Python."""
-    *first, last = map(written.shown, parts)
+    *first, last = map(written.format_value, parts)
     if first:
         subject = f"{', '.join(first)} and {last} exist"
     else:
@@ -588,7 +596,7 @@ def python_only_text(parts: Sequence[str]) -> str:
     return f"{subject} only in the Python session that asked."
 
 
-def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:
+def _make_settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:
     """Return one error for pydantic's errors, in the words of the settings."""
     declared = settings(config)
     known = {setting.name: setting for setting in declared}
@@ -600,21 +608,25 @@ def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchErr
             names = {setting.name for setting in declared}
             return UnknownNameError("setting", name, names)
         setting = known[name]
-        got = "nothing" if error["type"] == "missing" else written.shown(error["input"])
+        got = (
+            "nothing"
+            if error["type"] == "missing"
+            else written.format_value(error["input"])
+        )
         if setting.is_mapping and len(error["loc"]) > 1:
             got = f"{error['loc'][1]}={got}"
         problems.setdefault(setting.name, f"expected {setting.expects}, got {got}")
     return SettingsError(tuple(problems.items()))
 
 
-def _absolute(name: str) -> str:
+def _make_absolute(name: str) -> str:
     """Return the absolute path of a file; what is no file stays as it is.
 
     Of two files as in camera.csv+object.csv, each gets its path.
     """
     paths = split_paths(name)
     if len(paths) > 1:
-        return "+".join(map(_absolute, paths))
+        return "+".join(map(_make_absolute, paths))
     if os.path.isfile(name):
         path, mark, part = name, "", ""
     else:
@@ -625,6 +637,6 @@ def _absolute(name: str) -> str:
     return name
 
 
-def _file_names(entry: str) -> str:
+def _strip_directories(entry: str) -> str:
     """Return the names of files without their directories."""
     return "+".join(Path(path).name for path in split_paths(entry))

@@ -15,30 +15,30 @@ from typing import Any
 
 from pydantic import ValidationInfo, field_validator
 
-from advsearch.distributions import OwnQuantiles
+from advsearch.distributions import PythonQuantiles
 from advsearch.errors import FileFormatError, InputError
 from advsearch.trust.stored_files import parsed, present_text
 from advsearch.trust.yaml_text import LARGEST, parse_yaml
 
-LARGEST_WHOLE = 2**63 - 1
+MAX_INTEGER = 2**63 - 1
 
 
-def as_python(value: Any) -> Any:
+def to_python(value: Any) -> Any:
     """Convert numbers and arrays of numpy and torch in a value, which `is_shallow`, to
     Python's.
     """
-    if isinstance(value, OwnQuantiles):
+    if isinstance(value, PythonQuantiles):
         return value
     if isinstance(value, Mapping):
-        return {as_python(name): as_python(inner) for name, inner in value.items()}
+        return {to_python(name): to_python(inner) for name, inner in value.items()}
     if isinstance(value, (list, tuple)):
-        items = [as_python(item) for item in value]
+        items = [to_python(item) for item in value]
         return items if isinstance(value, list) else tuple(items)
     is_array = hasattr(value, "tolist") and hasattr(value, "dtype")
     return value.tolist() if is_array else value
 
 
-def as_text(value: Any, *, several: bool = False) -> Any:
+def to_text(value: Any, *, several: bool = False) -> Any:
     """Return a name as a text: a path, a number, or a list of such if there may be
     several.
 
@@ -60,39 +60,39 @@ def as_text(value: Any, *, several: bool = False) -> Any:
     return text
 
 
-def texts(*names: str, several: Sequence[str] = ()) -> Any:
-    """Return a validator that reads settings, and those with `several` names, by `as_text`."""
+def text_validator(*names: str, several: Sequence[str] = ()) -> Any:
+    """Return a validator that reads settings, and those with `several` names, by `to_text`."""
 
     def read(value: Any, info: ValidationInfo) -> Any:
-        return as_text(value, several=info.field_name in several)
+        return to_text(value, several=info.field_name in several)
 
     return field_validator(*names, *several, mode="before")(read)
 
 
-def each_once(*names: str) -> Any:
+def unique_names_validator(*names: str) -> Any:
     """Return a validator that rejects duplicate names in settings."""
 
     def check(value: str | None, info: ValidationInfo) -> str | None:
-        check_once(split_names(value or ""), str(info.field_name))
+        check_no_duplicates(split_names(value or ""), str(info.field_name))
         return value
 
     return field_validator(*names)(check)
 
 
-def all_finite(value: Any) -> bool:
+def are_all_finite(value: Any) -> bool:
     """Whether all numbers in a value, which `is_shallow`, are finite, and integers at most
     2**63 - 1.
     """
     if isinstance(value, Mapping):
-        return all(all_finite(inner) for inner in value.values())
+        return all(are_all_finite(inner) for inner in value.values())
     if isinstance(value, (list, tuple)):
-        return all(all_finite(inner) for inner in value)
+        return all(are_all_finite(inner) for inner in value)
     if isinstance(value, int):
-        return abs(value) <= LARGEST_WHOLE
+        return abs(value) <= MAX_INTEGER
     return not isinstance(value, float) or math.isfinite(value)
 
 
-def number_or_text(value: Any) -> Any:
+def parse_number_or_text(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     try:
@@ -125,13 +125,13 @@ def parse_assignments(texts: Iterable[str], setting: str) -> dict[str, object]:
         ValueError: a text is no assignment.
         InputError: a name comes twice.
     """
-    texts = list(texts)
+    texts = list(text_validator)
     for text in texts:
         name, equals, _ = text.partition("=")
         if not name.strip() or not equals:
             raise ValueError("not an assignment")
     pairs = [parse_assignment(text, setting) for text in texts]
-    check_once((name for name, _ in pairs), setting)
+    check_no_duplicates((name for name, _ in pairs), setting)
     return dict(pairs)
 
 
@@ -144,11 +144,11 @@ def parse_choices(texts: Iterable[str], setting: str) -> dict[str, object]:
         parse_assignment(text, setting) if "=" in text else (FOR_ALL, text)
         for text in texts
     ]
-    check_once((name for name, _ in pairs), setting)
+    check_no_duplicates((name for name, _ in pairs), setting)
     return dict(pairs)
 
 
-def read_controls(texts: Iterable[str], where: str) -> dict[str, object]:
+def parse_controls(texts: Iterable[str], where: str) -> dict[str, object]:
     """Parse controls with their settings: ``texture,pose``, ``texture={resolution:
     64}``, ``pose={...},x={...}``.
 
@@ -167,12 +167,12 @@ def read_controls(texts: Iterable[str], where: str) -> dict[str, object]:
             if isinstance(settings, str) and settings.startswith("{"):
                 raise InputError(
                     f"{where}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}} for "
-                    f"{name}, got {shown(settings)}; write "
+                    f"{name}, got {format_value(settings)}; write "
                     "a colon and a space behind each parameter, close every bracket, "
                     "and put a comma before the next control"
                 )
             controls.append((name, settings))
-    check_once((name for name, _ in controls), where)
+    check_no_duplicates((name for name, _ in controls), where)
     return dict(controls)
 
 
@@ -205,19 +205,19 @@ def split_names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def names_together(texts: Iterable[str]) -> str:
+def join_names(texts: Iterable[str]) -> str:
     """Join several such texts into one, without duplicates."""
     return ",".join(dict.fromkeys(name for text in texts for name in split_names(text)))
 
 
-def check_once(names: Iterable[str], setting: str) -> None:
+def check_no_duplicates(names: Iterable[str], setting: str) -> None:
     """Raise InputError, which names the setting, if a name comes twice."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise InputError(f"{setting}: {twice[0]} is given twice; leave one of them out")
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Format a value for an error message: plain, printable and not too long."""
     try:
         is_plain = isinstance(value, str) and value.strip() and value.isprintable()
@@ -234,8 +234,11 @@ HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
 """First line of every `run.yaml` that advsearch writes; a run directory is recognized
 by it.
 """
-MOST_BASES = 4  # maximum number of files that a `base` names, and of nested bases
-NAMED = ("policy", "task")  # the settings that are a name, or a `name` with options
+MAX_BASES = 4  # maximum number of files that a `base` names, and of nested bases
+NAME_SETTINGS = (
+    "policy",
+    "task",
+)  # the settings that are a name, or a `name` with options
 
 
 def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, object]:
@@ -258,7 +261,7 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
             f"{path}: expected settings and values such as 'object: mug', got {got}"
         )
     if data.get("schema", SCHEMA) != SCHEMA:
-        got = shown(data["schema"])
+        got = format_value(data["schema"])
         raise FileFormatError(
             f"{path}: expected schema {SCHEMA}, got {got}; it is of another advsearch"
         )
@@ -267,11 +270,11 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
         bases = [bases]
     if not isinstance(bases, list) or not all(isinstance(base, str) for base in bases):
         raise FileFormatError(
-            f"{path}: base: expected a file or a list of files, got {shown(bases)}"
+            f"{path}: base: expected a file or a list of files, got {format_value(bases)}"
         )
-    if len(above) >= MOST_BASES or len(bases) > MOST_BASES:
+    if len(above) >= MAX_BASES or len(bases) > MAX_BASES:
         raise FileFormatError(
-            f"{path}: base: expected at most {MOST_BASES} files, one "
+            f"{path}: base: expected at most {MAX_BASES} files, one "
             "over the other, got more"
         )
     resolved_path = Path(path).resolve()
@@ -282,25 +285,25 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
     result: dict[str, object] = {}
     for base in bases:
         base_path = Path(path).parent / base
-        result = merged(result, read_yaml(base_path, (*above, resolved_path)))
-    return merged(result, data)
+        result = merge_mappings(result, read_yaml(base_path, (*above, resolved_path)))
+    return merge_mappings(result, data)
 
 
-def merged(
-    under: Mapping[str, object], over: Mapping[str, object]
+def merge_mappings(
+    base: Mapping[str, object], override: Mapping[str, object]
 ) -> dict[str, object]:
-    """Return `under` overridden by `over`: mappings are merged, other values replaced."""
-    result = dict(under)
-    for name, value in over.items():
+    """Return `base` overridden by `override`: mappings are merged, other values replaced."""
+    result = dict(base)
+    for name, value in override.items():
         previous = result.get(name)
         if isinstance(previous, Mapping) and isinstance(value, Mapping):
-            result[name] = merged(previous, value)
+            result[name] = merge_mappings(previous, value)
         else:
             result[name] = value
     return result
 
 
-def put(data: dict[str, object], name: str, value: object) -> None:
+def set_dotted(data: dict[str, object], name: str, value: object) -> None:
     """Set the value of a dotted name in nested mappings.
 
     What follows ``set.`` is one name, because names of parameters have dots.
@@ -312,7 +315,7 @@ def put(data: dict[str, object], name: str, value: object) -> None:
     previous = data.get(first)
     inner = dict[str, object]()
     if isinstance(previous, str):
-        inner = {"name": previous} if first in NAMED else {previous: None}
+        inner = {"name": previous} if first in NAME_SETTINGS else {previous: None}
     elif isinstance(previous, list):
         inner = {key: None for key in previous}
     elif isinstance(previous, dict):
@@ -320,5 +323,5 @@ def put(data: dict[str, object], name: str, value: object) -> None:
     if first in ("set", "grid"):
         inner[rest] = value
     else:
-        put(inner, rest, value)
+        set_dotted(inner, rest, value)
     data[first] = inner

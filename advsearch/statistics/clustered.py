@@ -30,13 +30,13 @@ import numpy.typing as npt
 from advsearch.errors import InputError
 from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
 from advsearch.statistics.paired import mcnemar, paired_difference
-from advsearch.statistics.sequential import STAKES, edge_of, log_capital
+from advsearch.statistics.sequential import STAKES, find_threshold, log_capital
 
-Numbers = npt.NDArray[np.float64]
-Units = npt.NDArray[np.int64]
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 
-def per_unit(values: npt.ArrayLike, units: Units) -> Numbers:
+def sum_per_unit(values: npt.ArrayLike, units: IntArray) -> FloatArray:
     """Return the sum (m,) of values (n,) over each unit, in the order of the units.
 
     `units` (n,) are the units of the rows.
@@ -46,15 +46,15 @@ def per_unit(values: npt.ArrayLike, units: Units) -> Numbers:
     return np.bincount(unit_index.reshape(-1), weights).astype(np.float64)
 
 
-def mean_share(counted: npt.ArrayLike, of: npt.ArrayLike) -> float:
+def mean_rate(counted: npt.ArrayLike, rows: npt.ArrayLike) -> float:
     """Return the mean rate over units; NaN if none has a row.
 
     Args:
         counted: (n,) rows of each unit that count.
-        of: (n,) rows of each unit; units without any are left out.
+        rows: (n,) rows of each unit; units without any are left out.
     """
     n_counted = np.asarray(counted, dtype=np.float64)
-    n_rows = np.asarray(of, dtype=np.float64)
+    n_rows = np.asarray(rows, dtype=np.float64)
     n_counted = n_counted[n_rows > 0.0]
     n_rows = n_rows[n_rows > 0.0]
     if not len(n_rows):
@@ -64,21 +64,21 @@ def mean_share(counted: npt.ArrayLike, of: npt.ArrayLike) -> float:
     return float((n_counted / n_rows).mean())
 
 
-def share_interval(
-    counted: npt.ArrayLike, of: npt.ArrayLike, confidence: float = CONFIDENCE
+def rate_interval(
+    counted: npt.ArrayLike, rows: npt.ArrayLike, confidence: float = CONFIDENCE
 ) -> tuple[float, float]:
     """Return the interval of the mean rate over units, for any number of units.
 
     Args:
-        counted: (n,) rows of each unit that count, from 0 to `of`.
-        of: (n,) rows of each unit, from 0; at least one has rows.
+        counted: (n,) rows of each unit that count, from 0 to `rows`.
+        rows: (n,) rows of each unit, from 0; at least one has rows.
         confidence: between 0 and 1.
 
     Raises:
         InputError: counts are out of range.
     """
     n_counted = np.asarray(counted, dtype=np.float64)
-    n_rows = np.asarray(of, dtype=np.float64)
+    n_rows = np.asarray(rows, dtype=np.float64)
     has_rows = n_counted.shape == n_rows.shape and n_rows.size and n_rows.max() > 0
     if not has_rows or (n_counted < 0).any() or (n_counted > n_rows).any():
         raise InputError(
@@ -91,7 +91,7 @@ def share_interval(
     return _betting_interval(n_counted[is_used] / n_rows[is_used], confidence)
 
 
-def _betting_interval(samples: Numbers, confidence: float) -> tuple[float, float]:
+def _betting_interval(samples: FloatArray, confidence: float) -> tuple[float, float]:
     """Return the interval of the mean of independent samples (n,) in [0, 1], by bets."""
     values, counts = np.unique(samples, return_counts=True)
     threshold = np.log(2.0 / (1.0 - confidence))
@@ -104,7 +104,7 @@ def _betting_interval(samples: Numbers, confidence: float) -> tuple[float, float
         """Whether bets on "less than the mean" have won."""
         return bool(log_capital(1.0 - mean, 1.0 - values, counts) >= threshold)
 
-    return edge_of(may_be_mean), edge_of(is_too_large)
+    return find_threshold(may_be_mean), find_threshold(is_too_large)
 
 
 def mean_interval(
@@ -122,20 +122,20 @@ def mean_interval(
     return low + (high - low) * lower, low + (high - low) * upper
 
 
-def most_shown(units: int) -> float:
+def max_lower_bound(n_units: int) -> float:
     """Return the lower bound of the 95 % interval of a rate if all units are right.
 
     It is the largest that this number of units can show.
     """
-    return _betting_interval(np.ones(units), CONFIDENCE)[0]
+    return _betting_interval(np.ones(n_units), CONFIDENCE)[0]
 
 
-def paired_by_unit(
-    first: Any, second: Any, units: Units
+def compare_paired(
+    first: Any, second: Any, units: IntArray
 ) -> tuple[float, tuple[float, float], float]:
     """Compare two outcomes of the same rows, which are clustered in units.
 
-    All units weigh the same (`mean_share`). Where each has a single row, the exact
+    All units weigh the same (`mean_rate`). Where each has a single row, the exact
     tests of Newcombe and McNemar are used.
 
     Args:
@@ -157,32 +157,32 @@ def paired_by_unit(
         n_neither = n_rows - (n_both + n_first + n_second)
         difference, interval = paired_difference(n_both, n_first, n_second, n_neither)
         return difference, interval, mcnemar(n_first, n_second)
-    unit_rows = per_unit(np.ones(n_rows), units)
+    unit_rows = sum_per_unit(np.ones(n_rows), units)
     # 0 where only the first happens, 1 where only the second does, else 1/2
-    unit_advantage = per_unit((1.0 + second - 1.0 * first) / 2.0, units) / unit_rows
+    unit_advantage = sum_per_unit((1.0 + second - 1.0 * first) / 2.0, units) / unit_rows
     lower, upper = _betting_interval(unit_advantage, CONFIDENCE)
     once = np.ones(len(unit_rows))
     log_capital_second = log_capital(0.5, unit_advantage, once)
     log_capital_first = log_capital(0.5, 1.0 - unit_advantage, once)
     max_log_capital = max(log_capital_second, log_capital_first)
-    second_rate = mean_share(per_unit(second, units), unit_rows)
-    first_rate = mean_share(per_unit(first, units), unit_rows)
+    second_rate = mean_rate(sum_per_unit(second, units), unit_rows)
+    first_rate = mean_rate(sum_per_unit(first, units), unit_rows)
     p_value = float(min(1.0, 2.0 * np.exp(-max_log_capital)))
     return second_rate - first_rate, (2 * lower - 1, 2 * upper - 1), p_value
 
 
 # rates, the same inside and outside, under which the bets of the test are computed
-SHARES = np.linspace(0.0, 1.0, 402)[1:-1]
+NULL_RATES = np.linspace(0.0, 1.0, 402)[1:-1]
 # permutations of units, so that no p-value is below 0.0001
-EXCHANGES = 9_999
+N_PERMUTATIONS = 9_999
 
 
-def fewer_by_chance(
-    inside: npt.ArrayLike,
-    of: npt.ArrayLike,
-    beside: npt.ArrayLike,
-    rest: npt.ArrayLike,
-    times: float = 1.0,
+def one_sided_p_value(
+    n_right_inside: npt.ArrayLike,
+    n_inside: npt.ArrayLike,
+    n_right_outside: npt.ArrayLike,
+    n_outside: npt.ArrayLike,
+    copies: float = 1.0,
 ) -> float:
     """Return the one-sided p-value of fewer right predictions inside a rule.
 
@@ -190,35 +190,35 @@ def fewer_by_chance(
     each unit has a single prediction, this is Fisher's exact test. Where all units have
     equally many and lie inside or outside, units are permuted. Elsewhere, where the rule
     cuts through units or some have more predictions than others, it is a bound by bets
-    (`_betting_p_value`). All units weigh the same (`mean_share`).
+    (`_betting_p_value`). All units weigh the same (`mean_rate`).
 
     Args:
-        inside, of: (n,) of each unit, right predictions and predictions inside.
-        beside, rest: (n,) of each unit, right predictions and predictions outside.
-        times: how many copies there are of each of these units.
+        n_right_inside, of: (n,) of each unit, right predictions and predictions inside.
+        n_right_outside, rest: (n,) of each unit, right predictions and predictions outside.
+        copies: how many copies there are of each of these units.
     """
-    right_inside = np.asarray(inside, dtype=np.float64)
-    rows_inside = np.asarray(of, dtype=np.float64)
-    right_outside = np.asarray(beside, dtype=np.float64)
-    rows_outside = np.asarray(rest, dtype=np.float64)
+    right_inside = np.asarray(n_right_inside, dtype=np.float64)
+    rows_inside = np.asarray(n_inside, dtype=np.float64)
+    right_outside = np.asarray(n_right_outside, dtype=np.float64)
+    rows_outside = np.asarray(n_outside, dtype=np.float64)
     if not rows_inside.any() or not rows_outside.any():
         return 1.0
     unit_rows = rows_inside + rows_outside
     if unit_rows.max() == 1.0:
         return _fisher_p_value(
-            round(times * float(right_inside.sum())),
-            round(times * float(rows_inside.sum())),
-            round(times * float(right_outside.sum())),
-            round(times * float(rows_outside.sum())),
+            round(copies * float(right_inside.sum())),
+            round(copies * float(rows_inside.sum())),
+            round(copies * float(right_outside.sum())),
+            round(copies * float(rows_outside.sum())),
         )
     is_inside = rows_inside > 0.0
     is_cut = bool((is_inside & (rows_outside > 0.0)).any())
     if not is_cut and len(np.unique(unit_rows)) == 1:
         return _permutation_p_value(
             right_inside + right_outside,
-            n_inside=round(times * float(is_inside.sum())),
-            n_right_inside=times * float(right_inside.sum()),
-            times=times,
+            n_inside=round(copies * float(is_inside.sum())),
+            n_right_inside=copies * float(right_inside.sum()),
+            times=copies,
         )
     wrong_inside = np.divide(
         rows_inside - right_inside,
@@ -235,7 +235,7 @@ def fewer_by_chance(
     rates = np.stack(
         [wrong_inside, is_inside, rate_outside, rows_outside > 0.0], axis=1
     )
-    return _betting_p_value(rates, is_cut=is_cut, times=times)
+    return _betting_p_value(rates, is_cut=is_cut, times=copies)
 
 
 def _fisher_p_value(
@@ -250,7 +250,7 @@ def _fisher_p_value(
 
 
 def _permutation_p_value(
-    unit_right: Numbers, *, n_inside: int, n_right_inside: float, times: float
+    unit_right: FloatArray, *, n_inside: int, n_right_inside: float, times: float
 ) -> float:
     """Return the one-sided p-value of a permutation test over units of equal size.
 
@@ -264,13 +264,13 @@ def _permutation_p_value(
     n_units = np.round(times * n_units).astype(np.int64)
     rng = np.random.default_rng(0)
     sampled_units = rng.multivariate_hypergeometric(
-        n_units, min(n_inside, int(n_units.sum())), EXCHANGES, method="marginals"
+        n_units, min(n_inside, int(n_units.sum())), N_PERMUTATIONS, method="marginals"
     )
     n_as_few = (sampled_units @ values <= n_right_inside + 1e-9).sum()
-    return float((1 + n_as_few) / (1 + EXCHANGES))
+    return float((1 + n_as_few) / (1 + N_PERMUTATIONS))
 
 
-def _betting_p_value(rates: Numbers, *, is_cut: bool, times: float) -> float:
+def _betting_p_value(rates: FloatArray, *, is_cut: bool, times: float) -> float:
     """Return a bound of the p-value: one over the capital of bets.
 
     The bets are on "fewer inside than m, more outside", and the smallest capital of all
@@ -289,7 +289,10 @@ def _betting_p_value(rates: Numbers, *, is_cut: bool, times: float) -> float:
     )
     stake_fraction = 0.5 if is_cut else 1.0
     gains = stake_fraction * (
-        wrong_inside / (1.0 - SHARES) - is_inside + right_outside / SHARES - is_outside
+        wrong_inside / (1.0 - NULL_RATES)
+        - is_inside
+        + right_outside / NULL_RATES
+        - is_outside
     )
     with np.errstate(divide="ignore"):
         log_capitals = []

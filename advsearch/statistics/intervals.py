@@ -47,13 +47,13 @@ def clopper_pearson(
     return low, high
 
 
-def wilson(share: Any, n: Any) -> tuple[Any, Any]:
+def wilson_interval(rate: Any, n: Any) -> tuple[Any, Any]:
     """Return Wilson's 95 % score interval (1927) of rates of n trials.
 
     Both are numbers or arrays, and so are the lower and upper bounds.
     """
     z = float(ndtri(0.5 + CONFIDENCE / 2.0))
-    center = share + z * z / (2 * n)
-    half_width = z * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    center = rate + z * z / (2 * n)
+    half_width = z * np.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
     scale = 1 + z * z / n
     return (center - half_width) / scale, (center + half_width) / scale

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FALSE_ALARMS = 0.05
+SIGNIFICANCE = 0.05
 """Fraction of falling curves of which a dip is reported, at most."""
 
 
@@ -18,23 +18,23 @@ class Dip:
 
     Attributes:
         distance: the nearer one.
-        seen: pictures that are right there, and how many there are.
+        counts: pictures that are right there, and how many there are.
         until: the farthest of the distances beyond it that are compared with it.
-        beyond: pictures that are right at these, and how many there are.
-        p: how likely so large a difference is where the share falls with the distance;
+        counts_beyond: pictures that are right at these, and how many there are.
+        p_value: how likely so large a difference is where the share falls with the distance;
             of all differences that were looked at together.
     """
 
     distance: float
-    seen: tuple[int, int]
+    counts: tuple[int, int]
     until: float
-    beyond: tuple[int, int]
-    p: float
+    counts_beyond: tuple[int, int]
+    p_value: float
 
     @property
-    def is_shown(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether chance is no explanation."""
-        return self.p <= FALSE_ALARMS
+        return self.p_value <= SIGNIFICANCE
 
 
 def _fit_falling(
@@ -90,10 +90,10 @@ def find_dips(
         best = int(np.argmin(np.where(is_dip, p_values, np.inf)))
         dip = Dip(
             distance=float(distances[near]),
-            seen=(int(right[near]), int(counts[near])),
+            counts=(int(right[near]), int(counts[near])),
             until=float(distances[near + 1 + best]),
-            beyond=(int(right_beyond[best]), int(counts_beyond[best])),
-            p=min(1.0, float(p_values[best]) * n_comparisons),
+            counts_beyond=(int(right_beyond[best]), int(counts_beyond[best])),
+            p_value=min(1.0, float(p_values[best]) * n_comparisons),
         )
         dips.append(dip)
     return tuple(dips)

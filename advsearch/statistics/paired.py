@@ -7,7 +7,7 @@ import math
 from scipy.special import bdtr
 
 from advsearch.errors import InputError
-from advsearch.statistics.intervals import wilson
+from advsearch.statistics.intervals import wilson_interval
 
 
 def paired_difference(
@@ -33,8 +33,8 @@ def paired_difference(
         )
     second_rate = (both + second) / n
     first_rate = (both + first) / n
-    second_low, second_high = map(float, wilson(second_rate, n))
-    first_low, first_high = map(float, wilson(first_rate, n))
+    second_low, second_high = map(float, wilson_interval(second_rate, n))
+    first_low, first_high = map(float, wilson_interval(first_rate, n))
     phi = _phi_coefficient(both, first, second, neither)
 
     def combine(a: float, b: float) -> float:

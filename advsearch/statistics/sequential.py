@@ -16,20 +16,20 @@ from advsearch.errors import InputError
 from advsearch.statistics.intervals import CONFIDENCE
 
 
-def edge_of(beyond: Callable[[float], bool]) -> float:
+def find_threshold(is_beyond: Callable[[float], bool]) -> float:
     """Return where in (0, 1) a monotone condition begins to hold, by bisection.
 
     0 if it holds everywhere, 1 if it holds nowhere.
     """
     low = 1e-9
     high = 1.0 - 1e-9
-    if beyond(low):
+    if is_beyond(low):
         return 0.0
-    if not beyond(high):
+    if not is_beyond(high):
         return 1.0
     for _ in range(40):
         center = 0.5 * (low + high)
-        if beyond(center):
+        if is_beyond(center):
             high = center
         else:
             low = center
@@ -109,15 +109,15 @@ class ConfidenceSequence:
 
         `is_over` and `is_under` are monotone in the mean.
         """
-        lower = edge_of(lambda mean: not self.is_over(mean))
-        return lower, edge_of(self.is_under)
+        lower = find_threshold(lambda mean: not self.is_over(mean))
+        return lower, find_threshold(self.is_under)
 
     def _has_won(self, mean: float, counts: Mapping[float, int]) -> bool:
         threshold = np.log(self.sides / (1.0 - self.confidence))
-        return bool(capital(mean, counts) >= threshold)
+        return bool(log_capital_of_counts(mean, counts) >= threshold)
 
 
-def draws_needed(mean: float, *, confidence: float, value: float = 1.0) -> int:
+def count_needed_samples(mean: float, *, confidence: float, value: float = 1.0) -> int:
     """Return how many equal samples show that the true mean is over a number.
 
     It is by one side of a `ConfidenceSequence`; where the value is 1, no other samples
@@ -130,7 +130,9 @@ def draws_needed(mean: float, *, confidence: float, value: float = 1.0) -> int:
     """
 
     def is_enough(count: int) -> bool:
-        return capital(mean, {value: count}) >= math.log(1.0 / (1.0 - confidence))
+        return log_capital_of_counts(mean, {value: count}) >= math.log(
+            1.0 / (1.0 - confidence)
+        )
 
     upper = 1
     while not is_enough(upper):
@@ -138,7 +140,7 @@ def draws_needed(mean: float, *, confidence: float, value: float = 1.0) -> int:
     return bisect_left(range(1, upper + 1), True, key=is_enough) + 1
 
 
-def capital(mean: float, counts: Mapping[float, int]) -> float:
+def log_capital_of_counts(mean: float, counts: Mapping[float, int]) -> float:
     """Return the logarithm of the capital that bets on "more than `mean`" have made.
 
     It starts with 1; -inf where all is lost. `counts` has the samples in [0, 1].
@@ -148,17 +150,17 @@ def capital(mean: float, counts: Mapping[float, int]) -> float:
 
 
 def log_capital(
-    mean: float, values: npt.NDArray[Any], times: npt.NDArray[Any]
+    mean: float, values: npt.NDArray[Any], counts: npt.NDArray[Any]
 ) -> float:
-    """Return the logarithm of the capital; see `capital`.
+    """Return the logarithm of the capital; see `log_capital_of_counts`.
 
     Args:
         mean: that the bets are on.
         values: (n,) distinct samples in [0, 1].
-        times: (n,) how often each occurs.
+        counts: (n,) how often each occurs.
     """
     with np.errstate(divide="ignore"):
         factors = 1.0 - STAKES + STAKES * (values / mean)[:, None]
         log_factors = np.log(np.maximum(factors, 0.0))
-        log_capital_of_stake = (times[:, None] * log_factors).sum(axis=0)
+        log_capital_of_stake = (counts[:, None] * log_factors).sum(axis=0)
     return float(np.logaddexp.reduce(log_capital_of_stake) - np.log(len(STAKES)))

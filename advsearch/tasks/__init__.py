@@ -15,14 +15,14 @@ from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.options import (
     FROM_RUN,
-    JOINED,
     NOT_A_NUMBER,
     OUT_OF_VIEW,
     OUTCOME,
+    TASK_SEPARATOR,
     Outcome,
     check_options,
     check_takes,
-    told,
+    describe_value,
 )
 from advsearch.registry import Registry, get_class
 from advsearch.tasks.base import (
@@ -30,36 +30,36 @@ from advsearch.tasks.base import (
     Judgement,
     Mark,
     Prediction,
-    Said,
+    PredictionWithPayload,
     Sight,
     Task,
     Truth,
 )
 from advsearch.tasks.classification import (
-    NO,
+    MISSED_PREFIX,
     Classification,
     ClassTask,
     Labels,
-    members,
-    target_lead,
-    wrong_lead,
+    compute_target_lead,
+    compute_wrong_lead,
+    make_class_mask,
 )
 from advsearch.tasks.detection import Detection
 from advsearch.tasks.together import (
-    Joined,
+    EnsembleTask,
+    JointTask,
     Outputs,
-    Together,
     Truths,
-    all_said,
-    outcome_in,
+    join_predictions,
+    make_outcome_payload,
 )
 
-MOST_NUMBERS = 4  # maximum size of an output whose label lists its numbers
+MAX_LISTED_NUMBERS = 4  # maximum size of an output whose label lists its numbers
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnTask(Task):
-    """A task defined by a function, see `own_task`; its truth is the scene's facts."""
+class FunctionTask(Task):
+    """A task defined by a function, see `make_function_task`; its truth is the scene's facts."""
 
     name = "own"
     varies = True
@@ -70,7 +70,7 @@ class OwnTask(Task):
 
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
-    ) -> OwnTask:
+    ) -> FunctionTask:
         task = super().on(model, target=target, minimise=minimise)
         return replace(task, labels=tuple(model.labels) if model.named else ())
 
@@ -104,7 +104,7 @@ class OwnTask(Task):
             if values.ndim == 1 and len(values) == len(self.labels):
                 index = int(values.argmax())
                 prediction = Prediction(self.labels[index], index)
-            elif values.numel() <= MOST_NUMBERS:
+            elif values.numel() <= MAX_LISTED_NUMBERS:
                 numbers = [f"{value:.3g}" for value in values.flatten().tolist()]
                 prediction = Prediction(", ".join(numbers))
             else:
@@ -115,10 +115,10 @@ class OwnTask(Task):
         return predictions_of_images
 
     def truth_names(self, truth: Facts) -> tuple[str, ...]:
-        return (truth.label or truth.own_label or truth.object,)
+        return (truth.label or truth.object_label or truth.object,)
 
 
-def own_task(function: Callable[[Any, Facts], Tensor]) -> OwnTask:
+def make_function_task(function: Callable[[Any, Facts], Tensor]) -> FunctionTask:
     """Create a task from a function, whose name becomes the task's.
 
     Args:
@@ -133,14 +133,14 @@ def own_task(function: Callable[[Any, Facts], Tensor]) -> OwnTask:
     """
     name = getattr(function, "__name__", type(function).__name__)
     check_takes(f"task {name}", function, "output", "truth")
-    task_class: Any = type(name, (OwnTask,), {"name": name})
-    task: OwnTask = task_class(function=function)
+    task_class: Any = type(name, (FunctionTask,), {"name": name})
+    task: FunctionTask = task_class(function=function)
     return task
 
 
-def function_of(task: Task) -> Callable[..., Tensor] | None:
+def get_task_function(task: Task) -> Callable[..., Tensor] | None:
     """Return the function that a task was created from; None if there is none."""
-    return task.function if isinstance(task, OwnTask) else None
+    return task.function if isinstance(task, FunctionTask) else None
 
 
 TASKS: Registry[type[Task]] = Registry(
@@ -165,7 +165,7 @@ def make_task(task: AnyTask) -> Task:
 
     Args:
         task: a name; a mapping with a `name` and options, which are the fields of the
-            task's dataclass; a task, which is returned; or a function (`own_task`). For
+            task's dataclass; a task, which is returned; or a function (`make_function_task`). For
             a joint task, "detection+depth", the options of each stand under its name.
 
     Raises:
@@ -175,16 +175,16 @@ def make_task(task: AnyTask) -> Task:
     if isinstance(task, Task):
         return task
     if callable(task) and not isinstance(task, type):
-        return own_task(task)
+        return make_function_task(task)
     if not isinstance(task, (str, Mapping)):
         raise InputError(
             "task: expected a name, a mapping with a `name`, a Task or a "
-            f"function, got {told(task)}"
+            f"function, got {describe_value(task)}"
         )
     setting: Mapping[str, Any] = {"name": task} if isinstance(task, str) else task
     name = str(setting.get("name", Classification.name))
     options = {key: value for key, value in setting.items() if key != "name"}
-    if JOINED in name:
+    if TASK_SEPARATOR in name:
         return _make_joint_task(name, options)
     if name not in TASKS:
         raise UnknownNameError("task", name, TASKS)
@@ -197,13 +197,13 @@ def make_task(task: AnyTask) -> Task:
     return created
 
 
-def _make_joint_task(name: str, options: Mapping[str, Any]) -> Together:
+def _make_joint_task(name: str, options: Mapping[str, Any]) -> EnsembleTask:
     """Create the joint task of several names; each has its options under its name."""
-    names = [part.strip() for part in name.split(JOINED)]
+    names = [part.strip() for part in name.split(TASK_SEPARATOR)]
     for task_name, task_options in options.items():
         if task_name not in names:
             raise UnknownNameError(
-                f"option of task {JOINED.join(names)!r}:", task_name, names
+                f"option of task {TASK_SEPARATOR.join(names)!r}:", task_name, names
             )
         if not isinstance(task_options, Mapping):
             raise InputError(
@@ -214,7 +214,7 @@ def _make_joint_task(name: str, options: Mapping[str, Any]) -> Together:
         make_task({**options.get(task_name, {}), "name": task_name})
         for task_name in names
     ]
-    return Together(parts=tuple(parts))
+    return EnsembleTask(parts=tuple(parts))
 
 
 def __getattr__(name: str) -> Any:
@@ -224,7 +224,7 @@ def __getattr__(name: str) -> Any:
 
 __all__ = [
     "FROM_RUN",
-    "NO",
+    "MISSED_PREFIX",
     "NOT_A_NUMBER",
     "OUTCOME",
     "OUT_OF_VIEW",
@@ -233,28 +233,28 @@ __all__ = [
     "ClassTask",
     "Classification",
     "Detection",
+    "EnsembleTask",
     "Facts",
-    "Joined",
+    "FunctionTask",
+    "JointTask",
     "JsonValue",
     "Judgement",
     "Labels",
     "Mark",
     "Outcome",
     "Outputs",
-    "OwnTask",
     "Prediction",
-    "Said",
+    "PredictionWithPayload",
     "Sight",
     "Task",
-    "Together",
     "Truth",
     "Truths",
-    "all_said",
-    "function_of",
+    "compute_target_lead",
+    "compute_wrong_lead",
+    "get_task_function",
+    "join_predictions",
+    "make_class_mask",
+    "make_function_task",
+    "make_outcome_payload",
     "make_task",
-    "members",
-    "outcome_in",
-    "own_task",
-    "target_lead",
-    "wrong_lead",
 ]

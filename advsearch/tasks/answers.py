@@ -16,17 +16,17 @@ from advsearch.extend import InputError, Model, Task, tasks
 
 Words = tuple[str, ...]
 
-SILENCE = "(nothing)"  # label of an answer without a word
-MOST = 256  # maximum of `tokens` and of `times`
+EMPTY_ANSWER = "(nothing)"  # label of an answer without a word
+MAX_COUNT = 256  # maximum of `tokens` and of `times`
 
 
-class Texts(TypedDict):
+class AnswersWithoutLogits(TypedDict):
     """The answers of a model without logits about one image, one per request."""
 
     texts: list[str]
 
 
-class Utterance(TypedDict):
+class AnswerWithLogits(TypedDict):
     """The answer of a model with logits about one image.
 
     Attributes:
@@ -50,7 +50,7 @@ class FreeAnswer(Task):
     word have over all others, at the step where it is largest: the loss is log(1 - p) for a
     right answer and -log(p) for a wrong one.
 
-    For a model without logits (`Texts`) the loss is 1 - 2 s, where s is the fraction of
+    For a model without logits (`AnswersWithoutLogits`) the loss is 1 - 2 s, where s is the fraction of
     right answers among those about one image: it is right if at least half of them are.
 
     Args:
@@ -59,7 +59,7 @@ class FreeAnswer(Task):
             may differ.
 
     Raises:
-        InputError: `tokens` or `times` is less than one, or more than `MOST`.
+        InputError: `tokens` or `times` is less than one, or more than `MAX_COUNT`.
     """
 
     name = "answer"
@@ -72,10 +72,10 @@ class FreeAnswer(Task):
     def __post_init__(self) -> None:
         for name in ("tokens", "times"):
             value = getattr(self, name)
-            if not isinstance(value, int) or not 1 <= value <= MOST:
+            if not isinstance(value, int) or not 1 <= value <= MAX_COUNT:
                 raise InputError(
                     f"task answer: {name}: expected a whole number from 1 "
-                    f"to {MOST}, got {value!r}"
+                    f"to {MAX_COUNT}, got {value!r}"
                 )
 
     def on(
@@ -95,12 +95,14 @@ class FreeAnswer(Task):
             )
         return replace(
             self,
-            target=None if target is None else _words("target", target),
+            target=None if target is None else _parse_words("target", target),
             minimise=minimise,
         )
 
-    def read(self, returned: Any, count: int) -> list[Utterance | Texts]:
-        keys = Utterance.__required_keys__
+    def read(
+        self, returned: Any, count: int
+    ) -> list[AnswerWithLogits | AnswersWithoutLogits]:
+        keys = AnswerWithLogits.__required_keys__
         if isinstance(returned, (list, tuple)) and all(
             isinstance(answer, Mapping) and (keys <= answer.keys() or "texts" in answer)
             for answer in returned
@@ -120,12 +122,12 @@ class FreeAnswer(Task):
         Raises:
             InputError: there are none, or one is a target too.
         """
-        text = facts.own_label if facts.label is None else facts.label
+        text = facts.object_label if facts.label is None else facts.label
         if text is None:
             raise InputError(
                 f"label: expected the right words for {facts.object}, got none"
             )
-        right_words = _words("label", text)
+        right_words = _parse_words("label", text)
         common_words = sorted(set(right_words) & set(self.target or ()))
         if common_words:
             raise InputError(
@@ -137,7 +139,9 @@ class FreeAnswer(Task):
     def truth_names(self, truth: Words) -> Words:
         return truth
 
-    def loss(self, output: Sequence[Utterance | Texts], truth: Words) -> Tensor:
+    def loss(
+        self, output: Sequence[AnswerWithLogits | AnswersWithoutLogits], truth: Words
+    ) -> Tensor:
         """Compute the loss of each answer, (N,), see the class."""
         losses = []
         for answer in output:
@@ -153,7 +157,7 @@ class FreeAnswer(Task):
         return torch.stack(losses)
 
     def predictions(
-        self, output: Sequence[Utterance | Texts], count: int = 1
+        self, output: Sequence[AnswerWithLogits | AnswersWithoutLogits], count: int = 1
     ) -> list[tuple[tasks.Prediction, ...]]:
         """Return the texts about each image, the most frequent first, on one line and
         without control characters.
@@ -164,17 +168,17 @@ class FreeAnswer(Task):
             predictions_of_images.append(tuple(_prediction(text) for text, _ in texts))
         return predictions_of_images
 
-    def said(
+    def describe(
         self,
-        output: Sequence[Utterance | Texts],
+        output: Sequence[AnswerWithLogits | AnswersWithoutLogits],
         truth: Words,
         margins: Sequence[float],
-    ) -> list[tasks.Said]:
+    ) -> list[tasks.PredictionWithPayload]:
         """See `Task.said`: of several texts, the most frequent among those that decided.
 
         The payload has all of them.
         """
-        results = list[tasks.Said]()
+        results = list[tasks.PredictionWithPayload]()
         for answer, margin in zip(output, margins, strict=True):
             texts = _texts(answer)
             is_right = margin >= 0.0
@@ -214,7 +218,7 @@ def _token_lead(
     return (begin_logit - other_logit).max()
 
 
-def _texts(answer: Utterance | Texts) -> list[str]:
+def _texts(answer: AnswerWithLogits | AnswersWithoutLogits) -> list[str]:
     """Return all texts of an answer."""
     if "texts" in answer:
         return answer["texts"]
@@ -224,10 +228,10 @@ def _texts(answer: Utterance | Texts) -> list[str]:
 def _prediction(text: str) -> tasks.Prediction:
     """Return a text as a prediction: on one line, without control characters."""
     printable = "".join(char if char.isprintable() else " " for char in text)
-    return tasks.Prediction(" ".join(printable.split()) or SILENCE)
+    return tasks.Prediction(" ".join(printable.split()) or EMPTY_ANSWER)
 
 
-def _words(setting: str, text: str) -> Words:
+def _parse_words(setting: str, text: str) -> Words:
     """Parse words separated by commas, in lower case and without duplicates."""
     words = [
         " ".join(part.split()).casefold() for part in text.split(",") if part.strip()

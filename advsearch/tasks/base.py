@@ -102,13 +102,13 @@ class Judgement:
         return get_outcome(self.payload)
 
     @property
-    def not_a_number(self) -> bool:
+    def is_not_a_number(self) -> bool:
         """Whether the model returned NaN or infinity, neither right nor a success."""
         return self.prediction.label == NOT_A_NUMBER
 
 
 # The prediction about an image, and its payload: what else is stored of it.
-Said = tuple[Prediction, JsonValue]
+PredictionWithPayload = tuple[Prediction, JsonValue]
 
 
 @dataclass(frozen=True)
@@ -155,10 +155,10 @@ class Facts:
     Attributes:
         object: its name, for messages.
         label: the right label by the setting `label`; None without it.
-        own_label: the label that the object's file states; None if it states none.
-        describe: returns the values of the configuration by parameter ("pose.yaw"), in
+        object_label: the label that the object's file states; None if it states none.
+        describe_values: returns the values of the configuration by parameter ("pose.yaw"), in
             the units that rows have.
-        look: computes what is visible in the image, see `mask` and `depth`; None if the
+        compute_sight: computes what is visible in the image, see `mask` and `depth`; None if the
             facts belong to no configuration.
         each: the facts of each evaluated thing by name, the object first; empty if only
             the object is evaluated.
@@ -169,9 +169,9 @@ class Facts:
 
     object: str
     label: str | None = None
-    own_label: str | None = None
-    describe: Callable[[], Mapping[str, float]] = dict
-    look: Callable[[], Sight] | None = None
+    object_label: str | None = None
+    describe_values: Callable[[], Mapping[str, float]] = dict
+    compute_sight: Callable[[], Sight] | None = None
     each: Mapping[str, Facts] = field(default_factory=dict)
     others: tuple[Facts, ...] = ()
     views: tuple[Facts, ...] = ()
@@ -184,12 +184,12 @@ class Facts:
         Raises:
             InputError: the facts belong to no configuration.
         """
-        if self.look is None:
+        if self.compute_sight is None:
             raise InputError(
                 f"the task needs to see {self.object}, which depends on the "
                 "configuration; set `varies = True` on it"
             )
-        return self.look()
+        return self.compute_sight()
 
     @property
     def mask(self) -> Tensor:
@@ -233,7 +233,7 @@ class Facts:
     @cached_property
     def numbers(self) -> Mapping[str, float]:
         """The values of the configuration by parameter, both varied and fixed ones."""
-        return MappingProxyType(dict(self.describe()))
+        return MappingProxyType(dict(self.describe_values()))
 
     def number(self, name: str) -> float:
         """Return the value of a parameter in this configuration.
@@ -268,7 +268,7 @@ class Task(ABC):
             are checked as such, and the objectives of classification accept them.
         labelled: whether it takes a label. In a joint task, a label goes to the tasks
             that take one.
-        names_from: where its names come from, if neither from the model nor from the
+        names_source: where its names come from, if neither from the model nor from the
             setting `labels`.
         varies: whether the truth depends on the configuration; it is computed for each
             one then.
@@ -280,7 +280,7 @@ class Task(ABC):
     objective: ClassVar[str] = "score"
     reads_logits: ClassVar[bool] = False
     labelled: ClassVar[bool] = True
-    names_from: ClassVar[str] = ""
+    names_source: ClassVar[str] = ""
     varies: ClassVar[bool] = False
     judges_rig: ClassVar[bool] = False
     needs_all_images: ClassVar[bool] = False
@@ -298,7 +298,7 @@ class Task(ABC):
             Task.payloads,
             Task.marks,
             Task.judge,
-            Task.said,
+            Task.describe,
             Task.average,
             Task.after_calibration,
             Task.as_logits,
@@ -365,7 +365,7 @@ class Task(ABC):
             return returned.float()
         raise ValueError(f"expected a tensor with {count} rows, one for each picture")
 
-    def wrapped(self, network: Callable[..., Any]) -> Callable[..., Any]:
+    def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
         """Return a network that takes images alone; it is the same one unless the task passes
         further inputs to it.
         """
@@ -425,7 +425,7 @@ class Task(ABC):
             raise InputError(f"target: task {self.name} has none; leave it out")
         return replace(self, minimise=minimise)
 
-    def seeking(self: TaskType, objective: str) -> TaskType:
+    def with_objective(self: TaskType, objective: str) -> TaskType:
         """Return the task with one of its objectives, which may define what counts as success."""
         return self
 
@@ -476,7 +476,7 @@ class Task(ABC):
         return torch.stack(list(outputs)).mean(dim=0)
 
     @property
-    def of_one_image(self) -> Task:
+    def single_image_task(self) -> Task:
         """The task of a single image: for a rig of cameras that of each of its images,
         otherwise the task itself.
         """
@@ -510,7 +510,7 @@ class Task(ABC):
         with torch.no_grad():
             scores = self.score(output, truth).tolist()
             margins = (0.0 - self.loss(output, truth)).tolist()
-            described = self.said(output, truth, margins)
+            described = self.describe(output, truth, margins)
             return [
                 Judgement.of(score, margin, prediction, payload)
                 for score, margin, (prediction, payload) in zip(
@@ -518,9 +518,9 @@ class Task(ABC):
                 )
             ]
 
-    def said(
+    def describe(
         self, output: Output, truth: Truth, margins: Sequence[float]
-    ) -> list[Said]:
+    ) -> list[PredictionWithPayload]:
         """Return the prediction about each of N images and its payload.
 
         `margins` are those of the N judgements.
@@ -529,7 +529,7 @@ class Task(ABC):
         return list(zip(first_predictions, self.payloads(output), strict=True))
 
 
-def typical(judgements: Sequence[Judgement]) -> Judgement:
+def most_frequent_judgement(judgements: Sequence[Judgement]) -> Judgement:
     """Return the most frequent prediction of at least one judgement, as a judgement.
 
     Of equally frequent ones it is that with the lowest class index. Score, margin and

@@ -19,21 +19,21 @@ height; two corners with y first.
 """
 
 # Probabilities are clamped to [SMALLEST, 1 - SMALLEST], that is to log-odds of 13.8.
-SMALLEST = 1e-6
-LEAST_OVERLAP = 0.1
+MIN_PROBABILITY = 1e-6
+MIN_OVERLAP = 0.1
 """Minimum intersection over union of a box that is on the object at all (TIDE's
 threshold of the background).
 """
 
-AMONG = 500  # how many of the best scores are considered for the list of boxes
+MAX_CANDIDATES = 500  # how many of the best scores are considered for the list of boxes
 
-MOST = 2000
+MAX_SUPPRESSED = 2000
 """Maximum number of boxes of a class that take part in suppression, the best ones: a
 trained network has fewer.
 """
 
 
-def overlap(boxes: Tensor, box: Tensor) -> Tensor:
+def compute_iou(boxes: Tensor, box: Tensor) -> Tensor:
     """Compute the intersection over union of boxes with one box; differentiable.
 
     Args:
@@ -48,7 +48,7 @@ def overlap(boxes: Tensor, box: Tensor) -> Tensor:
     return intersection / union.clamp_min(1e-12)
 
 
-def share_inside(boxes: Tensor, box: Tensor) -> Tensor:
+def compute_fraction_inside(boxes: Tensor, box: Tensor) -> Tensor:
     """Compute the fraction of each box (D, 4) that lies in one box (4,), (D,) in
     [0, 1]; differentiable.
     """
@@ -65,7 +65,7 @@ def _area(boxes: Tensor) -> Tensor:
     return (boxes[..., 2:] - boxes[..., :2]).clamp_min(0.0).prod(dim=-1)
 
 
-def corners(boxes: Tensor, form: str) -> Tensor:
+def to_corners(boxes: Tensor, form: str) -> Tensor:
     """Convert boxes (..., 4) of one of `FORMS` to x0, y0, x1, y1; differentiable."""
     if form == "yxyx":
         return boxes[..., [1, 0, 3, 2]]
@@ -77,7 +77,7 @@ def corners(boxes: Tensor, form: str) -> Tensor:
     return torch.cat([top_left, top_left + size], dim=-1)
 
 
-def left_over(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
+def suppress_class(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
     """Apply greedy non-maximum suppression to the boxes of one class.
 
     Each round keeps the undecided boxes that no better undecided box overlaps, and
@@ -89,12 +89,12 @@ def left_over(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
         iou: intersection over union from which a better box suppresses another.
 
     Returns:
-        Which boxes survive, (D,) bool; none of those beyond the best `MOST` does.
+        Which boxes survive, (D,) bool; none of those beyond the best `MAX_SUPPRESSED` does.
     """
-    order = scores.argsort(descending=True)[:MOST]
+    order = scores.argsort(descending=True)[:MAX_SUPPRESSED]
     sorted_boxes = boxes[order]
     overlap_chunks = [
-        overlap(sorted_boxes, chunk[:, None]) >= iou
+        compute_iou(sorted_boxes, chunk[:, None]) >= iou
         for chunk in sorted_boxes.split(256)
     ]
     # Row i, column j: whether box j, which is better, overlaps box i.
@@ -111,7 +111,7 @@ def left_over(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Place:
+class DetectionTruth:
     """What a detector has to find in an image: the truth of detection.
 
     Attributes:
@@ -128,24 +128,24 @@ class Place:
     others: tuple[tuple[int, int, int, int], ...] = ()
 
     @property
-    def shares(self) -> Tensor | None:
+    def box_fractions(self) -> Tensor | None:
         """The box as fractions of the image's width and height, (4,)."""
-        return None if self.box is None else self.fractions_of(self.box)
+        return None if self.box is None else self.to_fractions(self.box)
 
-    def fractions_of(self, box: tuple[int, int, int, int]) -> Tensor:
+    def to_fractions(self, box: tuple[int, int, int, int]) -> Tensor:
         """Convert a box in pixels to fractions of width and height, (4,)."""
         height, width = self.size
         return torch.tensor(box) / torch.tensor([width, height, width, height])
 
 
-def overlap_with(detections: Detections, truth: Place) -> Tensor:
+def compute_iou_with_truth(detections: Detections, truth: DetectionTruth) -> Tensor:
     """Compute the intersection over union with the true box, which must exist, (D,)."""
-    assert truth.shares is not None
+    assert truth.box_fractions is not None
     boxes = detections["boxes"]
-    return overlap(boxes, truth.shares.to(boxes))
+    return compute_iou(boxes, truth.box_fractions.to(boxes))
 
 
-def suppressed(detections: Detections, least: float, iou: float) -> Detections:
+def suppress(detections: Detections, min_score: float, iou: float) -> Detections:
     """Set the scores of suppressed boxes to 0, class by class.
 
     The choice of boxes has no derivative; the scores that remain have. Boxes that come
@@ -153,7 +153,7 @@ def suppressed(detections: Detections, least: float, iou: float) -> Detections:
 
     Args:
         detections: of one image, with a score of every class.
-        least: minimum score of a box that takes part.
+        min_score: minimum score of a box that takes part.
         iou: intersection over union from which boxes are duplicates; 1 disables
             suppression.
     """
@@ -161,26 +161,26 @@ def suppressed(detections: Detections, least: float, iou: float) -> Detections:
         return detections
     scores = detections["scores"].detach()
     boxes = detections["boxes"].detach()
-    rows, classes = (scores >= least).nonzero(as_tuple=True)
+    rows, classes = (scores >= min_score).nonzero(as_tuple=True)
     is_suppressed = torch.zeros_like(scores, dtype=torch.bool)
     for label in classes.unique().tolist():
         class_rows = rows[classes == label]
         if len(class_rows) > 1:
-            survives = left_over(boxes[class_rows], scores[class_rows, label], iou)
+            survives = suppress_class(boxes[class_rows], scores[class_rows, label], iou)
             is_suppressed[class_rows, label] = ~survives
     remaining_scores = torch.where(is_suppressed, 0.0, detections["scores"])
     return {**detections, "scores": remaining_scores}
 
 
-def listed(
-    detections: Detections, count: int, least: float, iou: float
+def list_boxes(
+    detections: Detections, count: int, min_score: float, iou: float
 ) -> list[tuple[Box, int, float]]:
     """List the best boxes of an image after suppression, by falling score.
 
     Args:
         detections: of one image, boxes in fractions of width and height.
         count: maximum number of boxes.
-        least: minimum score.
+        min_score: minimum score.
         iou: intersection over union from which boxes of a class are duplicates.
 
     Returns:
@@ -189,10 +189,10 @@ def listed(
     rows, classes, scores = _top_scores(detections)
     boxes = detections["boxes"].detach()[rows]
     results: list[tuple[Box, int, float]] = []
-    for label in classes[scores >= least].unique().tolist():
-        is_candidate = (classes == label) & (scores >= least)
+    for label in classes[scores >= min_score].unique().tolist():
+        is_candidate = (classes == label) & (scores >= min_score)
         candidates = is_candidate.nonzero().flatten()
-        survives = left_over(boxes[candidates], scores[candidates], iou)
+        survives = suppress_class(boxes[candidates], scores[candidates], iou)
         # The scores are sorted, so the first are the best.
         for index in candidates[survives][:count].tolist():
             x0, y0, x1, y1 = boxes[index].tolist()
@@ -203,44 +203,44 @@ def listed(
 def _top_scores(detections: Detections) -> tuple[Tensor, Tensor, Tensor]:
     """Return the row, class and score (K,) each of the best scores, falling."""
     scores = detections["scores"].detach()
-    top_scores, flat_index = scores.flatten().topk(min(AMONG, scores.numel()))
+    top_scores, flat_index = scores.flatten().topk(min(MAX_CANDIDATES, scores.numel()))
     if "labels" in detections:
         return flat_index, detections["labels"][flat_index], top_scores
     n_classes = scores.shape[1]
     return flat_index // n_classes, flat_index % n_classes, top_scores
 
 
-def log_odds(probabilities: Tensor) -> Tensor:
+def compute_log_odds(probabilities: Tensor) -> Tensor:
     """Compute log(p / (1 - p)), with p clamped to [SMALLEST, 1 - SMALLEST]."""
-    clamped = probabilities.clamp(SMALLEST, 1.0 - SMALLEST)
+    clamped = probabilities.clamp(MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)
     return clamped.log() - torch.log1p(-clamped)
 
 
-def best_of(values: Tensor, among: Tensor | None = None) -> Tensor:
-    """Return the largest of values (D,), or of those where `among` (D,) is true; 0 if
+def max_or_zero(values: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the largest of values (D,), or of those where `mask` (D,) is true; 0 if
     there are none.
     """
-    candidates = values if among is None else torch.where(among, values, 0.0)
+    candidates = values if mask is None else torch.where(mask, values, 0.0)
     return torch.cat([candidates, candidates.new_zeros(1)]).amax()
 
 
 # ---- formats ----
 
 
-def nowhere(boxes: Tensor) -> Tensor:
+def are_invalid(boxes: Tensor) -> Tensor:
     """Whether boxes (D, 4) of any format are invalid, (D,) bool: four equal numbers, or one
     that is not finite.
     """
     return (boxes == boxes[:, :1]).all(dim=1) | ~boxes.isfinite().all(dim=1)
 
 
-def counted(detections: Detections) -> Tensor:
+def are_counted(detections: Detections) -> Tensor:
     """Which rows count, (D,) bool: they have a valid box and a number over 0 with it."""
-    has_number = (numbers_of(detections) > 0.0).any(dim=1)
-    return ~nowhere(detections["boxes"]) & has_number
+    has_number = (get_box_numbers(detections) > 0.0).any(dim=1)
+    return ~are_invalid(detections["boxes"]) & has_number
 
 
-def numbers_of(detections: Detections) -> Tensor:
+def get_box_numbers(detections: Detections) -> Tensor:
     """Return the numbers of each box that are scores, or may be, detached, (D, K)."""
     if "either" in detections:
         values = detections["either"].detach()
@@ -249,68 +249,70 @@ def numbers_of(detections: Detections) -> Tensor:
     return values if values.ndim == 2 else values[:, None]
 
 
-def as_option(options: str) -> str:
+def format_option(options: str) -> str:
     """Return options of detection as messages name settings."""
     return f"`task='detection={{{options}}}'`"
 
 
 UNITS = ("fractions", "pixels")
 
-KNOWN = "boxes_are_corners_in_pixels"
+DECLARED_FORMAT_ATTRIBUTE = "boxes_are_corners_in_pixels"
 """Attribute by which a network declares the format of its boxes, which is not inferred
 then.
 """
 
 # How many of the best boxes of an image the format is inferred from.
-LOOKED_AT = 100
+MAX_FORMAT_BOXES = 100
 
-FRACTION = 1.5
-PIXEL = 4.0
+MAX_FRACTION = 1.5
+MIN_PIXELS = 4.0
 """Limits of the median of the boxes' largest coordinates: up to the first these are
 fractions of the image, from the second on pixels.
 """
 
 # How far outside the image a box's center may lie, as a fraction of its width or height.
-BEYOND = 0.25
+MAX_CENTER_OVERSHOOT = 0.25
 
-ODD = 0.5
-USUAL = 0.8
+DOUBTFUL_FRACTION = 0.5
+PLAUSIBLE_FRACTION = 0.8
 """Fractions of plausible boxes: a format with less than the first is doubted, one with
 at least the second is suggested instead.
 """
 
 # By how much the best overlap with the object must grow for a format to be suggested.
-NEARER = 0.1
+MIN_IOU_GAIN = 0.1
 
 
 @dataclass(frozen=True)
-class Reading:
+class BoxFormat:
     """How the four numbers of a box are read.
 
     Attributes:
         form: one of `FORMS`.
         unit: one of `UNITS`.
-        size: of the model's input, (height, width) in pixels.
+        input_size: of the model's input, (height, width) in pixels.
     """
 
     form: str
     unit: str
-    size: tuple[int, int]
+    input_size: tuple[int, int]
 
-    def fractions(self, boxes: Tensor) -> Tensor:
+    def to_fractions(self, boxes: Tensor) -> Tensor:
         """Convert boxes (D, 4) to corners in fractions of width and height;
         differentiable.
         """
-        height, width = self.size if self.unit == "pixels" else (1, 1)
-        return corners(boxes, self.form) / boxes.new_tensor([width, height] * 2)
+        height, width = self.input_size if self.unit == "pixels" else (1, 1)
+        return to_corners(boxes, self.form) / boxes.new_tensor([width, height] * 2)
 
-    def faults(self, boxes: Tensor) -> dict[str, Tensor]:
+    def find_faults(self, boxes: Tensor) -> dict[str, Tensor]:
         """Find which of boxes (D, 4) are implausible in this format, (D,) bool by fault."""
-        fractions = self.fractions(boxes)
-        height, width = self.size
+        fractions = self.to_fractions(boxes)
+        height, width = self.input_size
         center = (fractions[:, :2] + fractions[:, 2:]) / 2.0
         box_size = fractions[:, 2:] - fractions[:, :2]
-        is_near_image = (center >= -BEYOND) & (center <= 1.0 + BEYOND)
+        is_near_image = (center >= -MAX_CENTER_OVERSHOOT) & (
+            center <= 1.0 + MAX_CENTER_OVERSHOOT
+        )
         size_in_pixels = box_size.abs() * box_size.new_tensor([width, height])
         return {
             "lie far outside the picture": ~is_near_image.all(dim=1),
@@ -320,34 +322,39 @@ class Reading:
             "are smaller than a pixel": ~(size_in_pixels > 1.0).any(dim=1),
         }
 
-    def usual(self, boxes: Tensor) -> float:
+    def compute_plausible_fraction(self, boxes: Tensor) -> float:
         """Compute the fraction of boxes (D, 4), D at least 1, that are plausible."""
-        has_fault = torch.stack([*self.faults(boxes).values()])
+        has_fault = torch.stack([*self.find_faults(boxes).values()])
         return float((~has_fault).all(dim=0).float().mean())
 
-    def fault(self, boxes: Tensor) -> str:
+    def describe_fault(self, boxes: Tensor) -> str:
         """Describe what is implausible about boxes (D, 4); empty if most are plausible."""
-        if not len(boxes) or self.usual(boxes) >= ODD:
+        if (
+            not len(boxes)
+            or self.compute_plausible_fraction(boxes) >= DOUBTFUL_FRACTION
+        ):
             return ""
         fraction_by_fault = {
             fault: 1.0 - float((~is_faulty).float().mean())
-            for fault, is_faulty in self.faults(boxes).items()
+            for fault, is_faulty in self.find_faults(boxes).items()
         }
         worst = max(fraction_by_fault, key=fraction_by_fault.__getitem__)
         return f"{100.0 * fraction_by_fault[worst]:.0f} % of them {worst}"
 
-    def instead(self, boxes: Tensor) -> str:
+    def suggest_plausible_formats(self, boxes: Tensor) -> str:
         """Suggest the formats in which boxes (D, 4) are plausible; empty if there is none.
 
         Of several, those that differ least from this one.
         """
         alternatives = [
-            Reading(form, unit, self.size) for unit in UNITS for form in FORMS[:3]
+            BoxFormat(form, unit, self.input_size)
+            for unit in UNITS
+            for form in FORMS[:3]
         ]
         changes = [
-            self.change_to(alternative)
+            self.format_change_to(alternative)
             for alternative in alternatives
-            if alternative.usual(boxes) >= USUAL
+            if alternative.compute_plausible_fraction(boxes) >= PLAUSIBLE_FRACTION
         ]
         if not changes:
             return ""
@@ -358,61 +365,63 @@ class Reading:
         ]
         return f"; {' or '.join(smallest_changes)} would mend that"
 
-    def change_to(self, other: Reading) -> str:
+    def format_change_to(self, other: BoxFormat) -> str:
         """Return the options that select another format, such as ``boxes: xywh``."""
         options = []
         if other.form != self.form:
             options.append(f"boxes: {other.form}")
         if other.unit != self.unit:
             options.append(f"unit: {other.unit}")
-        return as_option(", ".join(options))
+        return format_option(", ".join(options))
 
-    def better(self, boxes: Tensor, true: Tensor, least: float) -> str:
+    def suggest_better_format(
+        self, boxes: Tensor, true_box: Tensor, min_iou: float
+    ) -> str:
         """Suggest the format in which a box fits the true box much better; empty if none.
 
         Args:
             boxes: (D, 4), with a right class.
-            true: the true box (4,) in fractions of width and height.
-            least: minimum intersection over union in the suggested format, which must
-                exceed that in this one by `NEARER` too.
+            true_box: the true box (4,) in fractions of width and height.
+            min_iou: minimum intersection over union in the suggested format, which must
+                exceed that in this one by `MIN_IOU_GAIN` too.
         """
         if not len(boxes):
             return ""
         candidates = [self]
         candidates += [
-            Reading(form, unit, self.size) for unit in UNITS for form in FORMS
+            BoxFormat(form, unit, self.input_size) for unit in UNITS for form in FORMS
         ]
         best_overlap = {
-            candidate: float(overlap(candidate.fractions(boxes), true).max())
+            candidate: float(compute_iou(candidate.to_fractions(boxes), true_box).max())
             for candidate in candidates
         }
         best = max(best_overlap, key=best_overlap.__getitem__)
-        if best_overlap[best] >= max(least, best_overlap[self] + NEARER):
-            return self.change_to(best)
+        if best_overlap[best] >= max(min_iou, best_overlap[self] + MIN_IOU_GAIN):
+            return self.format_change_to(best)
         return ""
 
 
-def strongest_boxes(images: Sequence[Detections]) -> Tensor:
+def select_best_boxes(images: Sequence[Detections]) -> Tensor:
     """Return the boxes with the best scores of each image, as they came, (D, 4).
 
-    Rows that do not count are left out, see `counted`.
+    Rows that do not count are left out, see `are_counted`.
     """
     boxes_of_images = []
     for detections in images:
-        rows = counted(detections).nonzero().flatten()
-        numbers = numbers_of(detections)
+        rows = are_counted(detections).nonzero().flatten()
+        numbers = get_box_numbers(detections)
         # A box without numbers has a score of 0.
         score = numbers.amax(dim=1) if numbers.shape[1] else numbers.sum(dim=1)
-        best_rows = rows[score[rows].argsort(descending=True)[:LOOKED_AT]]
+        best_rows = rows[score[rows].argsort(descending=True)[:MAX_FORMAT_BOXES]]
         boxes_of_images.append(detections["boxes"].detach()[best_rows])
     return torch.cat(boxes_of_images) if boxes_of_images else torch.zeros(0, 4)
 
 
-def unit_in(boxes: Tensor) -> str:
+def infer_unit(boxes: Tensor) -> str:
     """Infer which of `UNITS` boxes (D, 4) of any format have; "" if it is open."""
     if not len(boxes):
         return ""
     largest = float(boxes.abs().amax(dim=1).median())
-    if largest <= FRACTION:
+    if largest <= MAX_FRACTION:
         return "fractions"
-    return "pixels" if largest >= PIXEL else ""
+    return "pixels" if largest >= MIN_PIXELS else ""

@@ -16,14 +16,14 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.models import Model, find_label_set
-from advsearch.models.labels import LabelsOrigin, fitting_labels, names_nothing
+from advsearch.models.labels import LabelsOrigin, fit_labels, is_nothing_name
 from advsearch.options import FROM_RUN, NOT_A_NUMBER
 from advsearch.tasks.base import Facts, Judgement, Output, Prediction, Task
 
 Labels = tuple[int, ...]
 ClassTaskType = TypeVar("ClassTaskType", bound="ClassTask")
 
-NO = "no "  # prefix of the label of an object that is not found
+MISSED_PREFIX = "no "  # prefix of the label of an object that is not found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +73,7 @@ class ClassTask(Task):
         if self.reads_logits:
             labels, named = model.labels, model.named
         else:
-            labels, named = self._names(model)
+            labels, named = self._get_model_labels(model)
         target_classes = None
         if target is not None:
             try:
@@ -84,13 +84,13 @@ class ClassTask(Task):
             self, labels=labels, named=named, target=target_classes, minimise=minimise
         )
 
-    def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
+    def _get_model_labels(self, model: Model) -> tuple[tuple[str, ...], bool]:
         """Return the names of the classes that a model predicts, and whether they are
         names or placeholders.
         """
         gray_image = torch.full((1, *model.input_size, 3), 0.5)
         with torch.no_grad():
-            n_classes = self.classes_in(model(gray_image))
+            n_classes = self.count_classes(model(gray_image))
         if n_classes is None:
             if not model.labels:
                 raise InputError(
@@ -98,16 +98,14 @@ class ClassTask(Task):
                     f"of model {model.name}, got none"
                 )
             return model.labels, True
-        labels = fitting_labels(
-            n_classes, model.labels or None, LabelsOrigin(), model.name
-        )
+        labels = fit_labels(n_classes, model.labels or None, LabelsOrigin(), model.name)
         return labels, bool(model.labels)
 
-    def classes_in(self, output: Output) -> int | None:
+    def count_classes(self, output: Output) -> int | None:
         """Return the number of classes of an output; None if it does not show it."""
         return None
 
-    def right_classes(self, facts: Facts) -> Labels:
+    def find_right_classes(self, facts: Facts) -> Labels:
         """Return the indices of the right classes: of the setting `label`, or else of the
         object's own label.
 
@@ -115,7 +113,7 @@ class ClassTask(Task):
             InputError: the model has no such class, the object has no label, or a target
                 is right.
         """
-        text = facts.own_label if facts.label is None else facts.label
+        text = facts.object_label if facts.label is None else facts.label
         if text is None:
             raise InputError(
                 f"label: expected the right labels for {facts.object}, got none"
@@ -138,10 +136,10 @@ class ClassTask(Task):
         return right_classes
 
     def check(self, facts: Facts) -> None:
-        self.right_classes(facts)
+        self.find_right_classes(facts)
 
     @cached_property
-    def nothing(self) -> Labels:
+    def nothing_classes(self) -> Labels:
         """Indices of classes that stand for no thing, such as "background".
 
         They are no predictions, unless they are targets.
@@ -152,18 +150,18 @@ class ClassTask(Task):
         return tuple(
             index
             for index, name in enumerate(self.labels)
-            if index not in targets and names_nothing(name)
+            if index not in targets and is_nothing_name(name)
         )
 
     @property
     def target_names(self) -> tuple[str, ...]:
-        return self.names(self.target or ())
+        return self.get_class_names(self.target or ())
 
-    def names(self, indices: Sequence[int]) -> tuple[str, ...]:
+    def get_class_names(self, indices: Sequence[int]) -> tuple[str, ...]:
         """Return the names of classes."""
-        return tuple(map(self.name_of, indices))
+        return tuple(map(self.get_class_name, indices))
 
-    def name_of(self, index: int) -> str:
+    def get_class_name(self, index: int) -> str:
         """Return the name of a class."""
         return self.labels[index] if index < len(self.labels) else f"class {index}"
 
@@ -181,13 +179,13 @@ class Classification(ClassTask):
     reads_logits = True
 
     def truth(self, facts: Facts) -> Labels:
-        return self.right_classes(facts)
+        return self.find_right_classes(facts)
 
     def as_logits(self, output: Tensor, truth: Labels) -> Tensor:
         """See `Task.as_logits`: a class that stands for no thing gets a logit of minus
         infinity, unless it is right or there is no other wrong class.
         """
-        nothing = set(self.nothing) - set(truth)
+        nothing = set(self.nothing_classes) - set(truth)
         n_classes = output.shape[1]
         if not nothing or len(nothing) + max(1, len(truth)) >= n_classes:
             return output
@@ -195,11 +193,11 @@ class Classification(ClassTask):
         return output.index_fill(1, indices, -math.inf)
 
     def loss(self, output: Tensor, truth: Labels) -> Tensor:
-        return wrong_lead(self.as_logits(output, truth), truth)
+        return compute_wrong_lead(self.as_logits(output, truth), truth)
 
     def score(self, output: Tensor, truth: Labels) -> Tensor:
         if self.target is not None:
-            return target_lead(self.as_logits(output, truth), self.target)
+            return compute_target_lead(self.as_logits(output, truth), self.target)
         return super().score(output, truth)
 
     def predictions(
@@ -208,9 +206,9 @@ class Classification(ClassTask):
         """Return the likeliest classes of each image; with a count of 1, the one with the
         lowest index of equally likely ones.
         """
-        return self._likeliest(self.as_logits(output, ()), count)
+        return self._rank_classes(self.as_logits(output, ()), count)
 
-    def _likeliest(self, logits: Tensor, count: int) -> list[tuple[Prediction, ...]]:
+    def _rank_classes(self, logits: Tensor, count: int) -> list[tuple[Prediction, ...]]:
         """Return the `count` likeliest classes of each row of logits (N, classes)."""
         probabilities = logits.detach().softmax(dim=1)
         if count == 1:
@@ -227,7 +225,7 @@ class Classification(ClassTask):
                 predictions_of_images.append((Prediction(NOT_A_NUMBER),))
                 continue
             predictions = tuple(
-                Prediction(self.name_of(class_id), class_id, probability)
+                Prediction(self.get_class_name(class_id), class_id, probability)
                 for class_id, probability in zip(
                     classes, class_probabilities, strict=True
                 )
@@ -241,7 +239,7 @@ class Classification(ClassTask):
         logits = self.as_logits(output, truth)
         task_class = type(self)
         if task_class.loss is Classification.loss:
-            losses = wrong_lead(logits, truth)
+            losses = compute_wrong_lead(logits, truth)
         else:
             losses = self.loss(output, truth)
         if task_class.score is not Classification.score or self.target is not None:
@@ -252,38 +250,44 @@ class Classification(ClassTask):
         for score, margin, predictions in zip(
             scores.tolist(),
             (0.0 - losses).tolist(),
-            self._likeliest(logits, 1),
+            self._rank_classes(logits, 1),
             strict=True,
         ):
             judgements.append(Judgement.of(score, margin, predictions[0]))
         return judgements
 
     def truth_names(self, truth: Sequence[int]) -> tuple[str, ...]:
-        return self.names(truth)
+        return self.get_class_names(truth)
 
 
 # ---- logits ----
 
 
-def wrong_lead(logits: Tensor, right: Labels) -> Tensor:
+def compute_wrong_lead(logits: Tensor, right: Labels) -> Tensor:
     """Compute the largest wrong logit minus the largest right one, (N,).
 
-    It is over 0 exactly if the prediction is wrong. Raises InputError as `members`.
+    It is over 0 exactly if the prediction is wrong. Raises InputError as `make_class_mask`.
     """
-    is_right = members(logits, right)
-    return largest(logits, ~is_right) - largest(logits, is_right)
+    is_right = make_class_mask(logits, right)
+    return compute_largest_logit(logits, ~is_right) - compute_largest_logit(
+        logits, is_right
+    )
 
 
-def target_lead(logits: Tensor, targets: Labels) -> Tensor:
+def compute_target_lead(logits: Tensor, targets: Labels) -> Tensor:
     """Compute the largest logit of the targets minus the largest other one, (N,).
 
-    It is over 0 exactly if a target is predicted. Raises InputError as `members`.
+    It is over 0 exactly if a target is predicted. Raises InputError as `make_class_mask`.
     """
-    is_target = members(logits, targets, "target")
-    return largest(logits, is_target) - largest(logits, ~is_target)
+    is_target = make_class_mask(logits, targets, "target")
+    return compute_largest_logit(logits, is_target) - compute_largest_logit(
+        logits, ~is_target
+    )
 
 
-def members(logits: Tensor, labels: Labels | Tensor, setting: str = "label") -> Tensor:
+def make_class_mask(
+    logits: Tensor, labels: Labels | Tensor, setting: str = "label"
+) -> Tensor:
     """Return which classes are in a label set, (C,) bool.
 
     Args:
@@ -320,9 +324,9 @@ def members(logits: Tensor, labels: Labels | Tensor, setting: str = "label") -> 
     return is_member
 
 
-def largest(logits: Tensor, among: Tensor) -> Tensor:
-    """Return the largest logit (N,) of the classes (C,) that are true in `among`.
+def compute_largest_logit(logits: Tensor, class_mask: Tensor) -> Tensor:
+    """Return the largest logit (N,) of the classes (C,) that are true in `class_mask`.
 
     Ties share the gradient.
     """
-    return logits.masked_fill(~among, -math.inf).amax(dim=1)
+    return logits.masked_fill(~class_mask, -math.inf).amax(dim=1)

@@ -23,14 +23,14 @@ from advsearch.extend import (
 
 Numbers = tuple[float, ...]
 
-MOST = 4096  # maximum of numbers of a state, and of elements of an action
-LARGEST = 1 << 20  # maximum size of a file with a state, in bytes
+MAX_NUMBERS = 4096  # maximum of numbers of a state, and of elements of an action
+MAX_STATE_BYTES = 1 << 20  # maximum size of a file with a state, in bytes
 
 INSIDE = "action within its envelope"
 REACHED = "action within the envelope of the target"
 """Labels of actions; others are outside their envelope."""
 
-SHOWN = 4  # how many elements of an action its text has
+MAX_FORMATTED_ELEMENTS = 4  # how many elements of an action its text has
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,10 +88,10 @@ class Command(Task):
                     f"got {min(self.envelope):g}"
                 )
 
-    def wrapped(self, network: Callable[..., Any]) -> Callable[..., Any]:
+    def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
         """See `Task.wrapped`: a policy gets the state next to images."""
         if isinstance(network, models.AllAtOnce):
-            inner: Any = self.wrapped(network.network)
+            inner: Any = self.wrap_network(network.network)
             return models.AllAtOnce(inner, network.cameras, network.layout)
         policy = network.network if isinstance(network, models.WithState) else network
         if self.state or hasattr(policy, "select_action"):
@@ -120,9 +120,9 @@ class Command(Task):
             )
         if actions.ndim == 1:
             actions = actions[:, None]
-        if actions.ndim != 2 or not 1 <= actions.shape[1] <= MOST:
+        if actions.ndim != 2 or not 1 <= actions.shape[1] <= MAX_NUMBERS:
             raise ValueError(
-                f"expected one action for each picture, (N, A), with A from 1 to {MOST}"
+                f"expected one action for each picture, (N, A), with A from 1 to {MAX_NUMBERS}"
             )
         for option in ("envelope", "names", "units"):
             size = len(getattr(self, option) or ())
@@ -282,16 +282,16 @@ class Command(Task):
             for action in output.tolist()
         ]
 
-    def said(
+    def describe(
         self, output: Tensor, truth: Tensor | None, margins: Sequence[float]
-    ) -> list[tasks.Said]:
+    ) -> list[tasks.PredictionWithPayload]:
         """See `Task.said`: whether an action left its envelope, and by which element.
 
         The payload has the action and the clean one, also as text, and the number of
         envelopes between them.
         """
         assert truth is not None
-        results: list[tasks.Said] = []
+        results: list[tasks.PredictionWithPayload] = []
         reaches_target = [False] * len(output)
         if self.target is not None:
             reaches_target = (self.loss(output, self.target) <= 0.0).tolist()
@@ -332,13 +332,13 @@ class Command(Task):
         """Return the first elements of an action as text, with names and units."""
         units = self.units if len(self.units) > 1 else [*self.units] * len(action)
         elements = []
-        for index, number in enumerate(action[:SHOWN]):
+        for index, number in enumerate(action[:MAX_FORMATTED_ELEMENTS]):
             name = f"{self._name(index)} " if with_names else ""
             unit = units[index] if units else ""
             elements.append(f"{name}{sign}{number:.3g} {unit}".rstrip())
         text = ", ".join(elements)
-        if len(action) > SHOWN:
-            text += f" and {len(action) - SHOWN} more"
+        if len(action) > MAX_FORMATTED_ELEMENTS:
+            text += f" and {len(action) - MAX_FORMATTED_ELEMENTS} more"
         return text
 
 
@@ -351,7 +351,7 @@ def _parse_names(option: str, value: Any) -> tuple[str, ...]:
     are_names = all(
         isinstance(name, str) and name and name.isprintable() for name in names
     )
-    if len(names) > MOST or not are_names:
+    if len(names) > MAX_NUMBERS or not are_names:
         raise InputError(
             f"task command: {option}: expected texts, or one with commas between "
             f"them, got {value!r:.80}"
@@ -370,11 +370,13 @@ def _parse_numbers(option: str, value: Any) -> Numbers:
     except (TypeError, ValueError, OverflowError):
         numbers = ()
     are_finite = all(math.isfinite(number) and abs(number) < 1e30 for number in numbers)
-    if not 1 <= len(numbers) <= MOST or not are_finite:
-        got = f"{len(items):,} of them" if len(items) > MOST else f"{value!r:.80}"
+    if not 1 <= len(numbers) <= MAX_NUMBERS or not are_finite:
+        got = (
+            f"{len(items):,} of them" if len(items) > MAX_NUMBERS else f"{value!r:.80}"
+        )
         raise InputError(
             f"task command: {option}: expected a finite number, or a list of 1 to "
-            f"{MOST} of them, got {got}"
+            f"{MAX_NUMBERS} of them, got {got}"
         )
     return numbers
 
@@ -401,9 +403,9 @@ def _load_state(value: Any) -> dict[str, Numbers]:
         name: _parse_numbers(f"state {name:.40}", numbers)
         for name, numbers in value.items()
     }
-    if sum(map(len, state.values())) > MOST:
+    if sum(map(len, state.values())) > MAX_NUMBERS:
         raise InputError(
-            f"task command: state: expected at most {MOST:,} numbers in all"
+            f"task command: state: expected at most {MAX_NUMBERS:,} numbers in all"
         )
     return state
 
@@ -412,7 +414,7 @@ def _read_state_file(path: Path) -> Any:
     """Read a JSON file. Raises FileFormatError if it cannot be read, or is no JSON."""
     expected = "a state: numbers by name in JSON"
     try:
-        text = stored_files.read_text(path, expected, LARGEST)
+        text = stored_files.read_text(path, expected, MAX_STATE_BYTES)
         return stored_files.parse_json(text, finite=True)
     except OSError as error:
         raise errors.FileFormatError(

@@ -22,7 +22,7 @@ from torch import Tensor
 from advsearch.extend import InputError, Model, Task, tasks
 
 # Minimum cosine of the angle to the camera's axis at which z-depth is a distance.
-ASIDE = 0.1
+MIN_AXIS_COSINE = 0.1
 DISPARITY = "relative disparity"
 RELATIVE = "relative depth"
 METRIC = "metric depth"
@@ -38,30 +38,30 @@ AS_FAR = "as far as it is"
 OUT_OF_SHAPE = "out of shape"
 NEARER = "nearer than it is"
 FARTHER = "farther than it is"
-GONE = "as far as what is behind it"
-LABELS = {"nearer": NEARER, "farther": FARTHER, "gone": GONE}
+AS_BACKGROUND = "as far as what is behind it"
+LABELS = {"nearer": NEARER, "farther": FARTHER, "gone": AS_BACKGROUND}
 GOALS = {
     "nearer": f"the object is judged {NEARER}",
     "farther": f"the object is judged {FARTHER}",
-    "gone": f"the object is judged to be {GONE}",
+    "gone": f"the object is judged to be {AS_BACKGROUND}",
 }
 """What an attack may seek, by the name of the objective."""
 
-FEWEST = 16
-SPREAD = 1.1
+MIN_FIT_PIXELS = 16
+MIN_DISTANCE_RATIO = 1.1
 """Minimum number of pixels outside the object for the fit of scale and shift, and
 minimum ratio of their farthest to their nearest distance.
 """
-LARGEST = 100.0  # maximum factor by which a pixel counts as too near or too far
+MAX_FACTOR = 100.0  # maximum factor by which a pixel counts as too near or too far
 
-Map = Mapping[str, Tensor]
+DepthMap = Mapping[str, Tensor]
 """What a model returns for one image: (h, w), by one of `KINDS`, or "" if it does not
 state which.
 """
 
 
 @dataclass(frozen=True, eq=False)
-class Distances:
+class DepthTruth:
     """The true distances in an image: the truth of depth.
 
     Attributes:
@@ -76,35 +76,35 @@ class Distances:
     metres: float | None = None
 
     @property
-    def seen(self) -> bool:
+    def is_visible(self) -> bool:
         """Whether any of the object is visible."""
         return bool(self.mask.any())
 
     @cached_property
-    def beside(self) -> Tensor:
+    def outside_object(self) -> Tensor:
         """The pixels outside the object at a finite distance, (H, W) bool."""
         return self.z.isfinite() & ~self.mask
 
     @cached_property
-    def anchored(self) -> bool:
+    def determines_scale(self) -> bool:
         """Whether the pixels outside the object determine scale and shift.
 
         There must be enough of them, and their distances must differ enough.
         """
-        distances = self.z[self.beside]
-        if len(distances) < FEWEST:
+        distances = self.z[self.outside_object]
+        if len(distances) < MIN_FIT_PIXELS:
             return False
-        return float(distances.max()) >= SPREAD * float(distances.min())
+        return float(distances.max()) >= MIN_DISTANCE_RATIO * float(distances.min())
 
     @property
-    def fitted(self) -> Tensor:
+    def fit_mask(self) -> Tensor:
         """The pixels on which scale and shift are fitted, (H, W) bool: those outside the object,
         or all if those do not determine them.
         """
-        return self.beside if self.anchored else self.z.isfinite()
+        return self.outside_object if self.determines_scale else self.z.isfinite()
 
     @cached_property
-    def behind(self) -> Tensor:
+    def background_disparity(self) -> Tensor:
         """The disparity of what is behind the object, (H, W); NaN if it is unknown.
 
         It is interpolated linearly between the nearest pixels to the left and right of the
@@ -163,7 +163,7 @@ class Depth(Task):
 
     def __post_init__(self) -> None:
         self.check_numbers(
-            lambda value: 0.0 < value < LARGEST,
+            lambda value: 0.0 < value < MAX_FACTOR,
             "a number over 0, under 100",
             "tolerance",
         )
@@ -180,7 +180,7 @@ class Depth(Task):
 
     # ---- reading ----
 
-    def read(self, returned: Any, count: int) -> list[Map]:
+    def read(self, returned: Any, count: int) -> list[DepthMap]:
         """Read the map (h, w) of each image, by what its values are.
 
         Raises:
@@ -223,7 +223,7 @@ class Depth(Task):
             )
         return super().on(model, target=target, minimise=minimise)
 
-    def seeking(self, objective: str) -> Depth:
+    def with_objective(self, objective: str) -> Depth:
         return replace(self, seek=objective) if objective in GOALS else self
 
     @property
@@ -231,13 +231,13 @@ class Depth(Task):
         return True
 
     def after_calibration(
-        self, output: Sequence[Map], truth: Distances | None
+        self, output: Sequence[DepthMap], truth: DepthTruth | None
     ) -> Depth:
         """See `Task.after_calibration`: find out what the values are."""
         kind = self.kind or next(iter(output[0]))
         return replace(self, resolved_kind=kind, missing=self._missing(kind, truth))
 
-    def _missing(self, kind: str, truth: Distances | None) -> str:
+    def _missing(self, kind: str, truth: DepthTruth | None) -> str:
         """Return what the user has to state before predictions can be judged, "" if nothing."""
         if not kind:
             return (
@@ -251,12 +251,17 @@ class Depth(Task):
                 "give its longest side in metres, "
                 "such as `size=0.1`"
             )
-        if kind != METRIC and truth is not None and truth.seen and not truth.anchored:
+        if (
+            kind != METRIC
+            and truth is not None
+            and truth.is_visible
+            and not truth.determines_scale
+        ):
             return (
                 "it predicts up to a scale and a shift, which are found on what is "
                 "seen beside the object: expected "
-                f"{FEWEST} pixels at distances that differ by a factor of {SPREAD:g}, "
-                f"got {int(truth.beside.sum())}; "
+                f"{MIN_FIT_PIXELS} pixels at distances that differ by a factor of {MIN_DISTANCE_RATIO:g}, "
+                f"got {int(truth.outside_object.sum())}; "
                 "give a scene with a ground or a room, and a camera that sees it from "
                 "the side"
             )
@@ -285,27 +290,27 @@ class Depth(Task):
         if facts.label is not None:
             raise InputError("label: task depth has no classes; leave it out")
 
-    def truth(self, facts: tasks.Facts) -> Distances:
+    def truth(self, facts: tasks.Facts) -> DepthTruth:
         """Return where the object is visible, and the distance of everything.
 
         Raises:
             InputError: the lens sees so far from its axis that z-depth is no distance.
         """
-        if bool((facts.z_depth < ASIDE * facts.depth).any()):
+        if bool((facts.z_depth < MIN_AXIS_COSINE * facts.depth).any()):
             raise InputError(
                 "task depth: a model's depth is the distance along the camera's axis, "
                 "and this lens sees things more "
-                f"than {math.degrees(math.acos(ASIDE)):.0f} degrees from its axis; "
+                f"than {math.degrees(math.acos(MIN_AXIS_COSINE)):.0f} degrees from its axis; "
                 "take a lens that sees less"
             )
-        return Distances(facts.mask, facts.z_depth, facts.sight.metres)
+        return DepthTruth(facts.mask, facts.z_depth, facts.sight.metres)
 
-    def truth_names(self, truth: Distances) -> tuple[str, ...]:
+    def truth_names(self, truth: DepthTruth) -> tuple[str, ...]:
         return (AS_FAR,)
 
     # ---- loss and score ----
 
-    def loss(self, output: Sequence[Map], truth: Distances) -> Tensor:
+    def loss(self, output: Sequence[DepthMap], truth: DepthTruth) -> Tensor:
         """Compute how much the object's distance is off beyond the tolerance, (N,).
 
         That is the mean over its pixels of |log(predicted / true)|, minus log(1 +
@@ -317,7 +322,7 @@ class Depth(Task):
             lambda log_factors: log_factors.abs().mean() - self._log_limit,
         )
 
-    def score(self, output: Sequence[Map], truth: Distances) -> Tensor:
+    def score(self, output: Sequence[DepthMap], truth: DepthTruth) -> Tensor:
         """Compute how near each of N outputs is to what is sought, (N,); over 0 if it is a
         success.
 
@@ -347,8 +352,8 @@ class Depth(Task):
 
     def _map_images(
         self,
-        output: Sequence[Map],
-        truth: Distances,
+        output: Sequence[DepthMap],
+        truth: DepthTruth,
         function: Callable[[Tensor], Tensor],
     ) -> Tensor:
         """Apply a function to the log factors of the object's pixels in each image, (N,).
@@ -357,17 +362,17 @@ class Depth(Task):
         """
         values = []
         for depth_map in output:
-            if truth.seen:
+            if truth.is_visible:
                 values.append(function(self._log_factors(depth_map, truth)))
             else:
                 # The product keeps the value attached to the graph.
                 values.append(next(iter(depth_map.values())).sum() * 0.0 - 1.0)
         return torch.stack(values)
 
-    def _log_factors(self, depth_map: Map, truth: Distances) -> Tensor:
+    def _log_factors(self, depth_map: DepthMap, truth: DepthTruth) -> Tensor:
         """Compute log(predicted / true) of each of the object's pixels, (P,).
 
-        The factors are clamped to `LARGEST` and its inverse.
+        The factors are clamped to `MAX_FACTOR` and its inverse.
         """
         predicted, is_inverse = self._align(depth_map, truth)
         mask = truth.mask.to(predicted.device)
@@ -376,12 +381,12 @@ class Depth(Task):
             ratio = predicted[mask] * z[mask]
         else:
             ratio = predicted[mask] / z[mask]
-        log_ratio = ratio.clamp(1.0 / LARGEST, LARGEST).log()
+        log_ratio = ratio.clamp(1.0 / MAX_FACTOR, MAX_FACTOR).log()
         # A number that is NaN anywhere in the map makes all of them NaN.
         nan_anywhere = predicted.sum() * 0.0
         return (-log_ratio if is_inverse else log_ratio) + nan_anywhere
 
-    def _align(self, depth_map: Map, truth: Distances) -> tuple[Tensor, bool]:
+    def _align(self, depth_map: DepthMap, truth: DepthTruth) -> tuple[Tensor, bool]:
         """Return the predicted z-depth of every pixel in units of the truth, (H, W), or its
         inverse; and whether it is the inverse.
 
@@ -398,12 +403,12 @@ class Depth(Task):
             scale = (truth.metres or 1.0) / self.size if self.size else 1.0
             return values * scale, False
         z = truth.z.to(values.device)
-        fit_mask = truth.fitted.to(values.device)
+        fit_mask = truth.fit_mask.to(values.device)
         if kind == DISPARITY:
             return _fit_scale_and_shift(values, z.reciprocal(), fit_mask), True
         return _fit_scale_and_shift(values, z, fit_mask), False
 
-    def _relief(self, log_factors: Tensor, truth: Distances) -> Tensor:
+    def _relief(self, log_factors: Tensor, truth: DepthTruth) -> Tensor:
         """Compute the remaining fraction of the object's relief, ().
 
         It is 1 if all distances are true, and 0 if the object is as far as what is behind
@@ -412,7 +417,7 @@ class Depth(Task):
         """
         mask = truth.mask
         disparity = truth.z[mask].reciprocal().to(log_factors)
-        behind = truth.behind[mask].to(log_factors)
+        behind = truth.background_disparity[mask].to(log_factors)
         is_known = behind.isfinite()
         true_relief = (disparity - behind)[is_known]
         squared_relief = true_relief.square().sum()
@@ -425,7 +430,7 @@ class Depth(Task):
     # ---- predictions ----
 
     def predictions(
-        self, output: Sequence[Map], count: int = 1
+        self, output: Sequence[DepthMap], count: int = 1
     ) -> list[tuple[tasks.Prediction, ...]]:
         """Return the range of the values of each map."""
         predictions_of_images: list[tuple[tasks.Prediction, ...]] = []
@@ -439,15 +444,15 @@ class Depth(Task):
             predictions_of_images.append((tasks.Prediction(label),))
         return predictions_of_images
 
-    def said(
-        self, output: Sequence[Map], truth: Distances, margins: Sequence[float]
-    ) -> list[tasks.Said]:
+    def describe(
+        self, output: Sequence[DepthMap], truth: DepthTruth, margins: Sequence[float]
+    ) -> list[tasks.PredictionWithPayload]:
         """See `Task.said`; the payload has the factor by which the distance is off, the
         remaining relief, and where scale and shift were fitted.
         """
-        if not truth.seen:
+        if not truth.is_visible:
             return [(tasks.Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
-        results: list[tasks.Said] = []
+        results: list[tasks.PredictionWithPayload] = []
         distance = float(truth.z[truth.mask].double().log().mean().exp())
         for depth_map, margin in zip(output, margins, strict=True):
             log_factors = self._log_factors(depth_map, truth)
@@ -461,7 +466,9 @@ class Depth(Task):
             }
             if (self.kind or next(iter(depth_map))) != METRIC:
                 payload["fitted"] = (
-                    "beside the object" if truth.anchored else "in the whole picture"
+                    "beside the object"
+                    if truth.determines_scale
+                    else "in the whole picture"
                 )
             label = (
                 AS_FAR if margin >= 0.0 else self._error_label(mean_log_factor, relief)
@@ -482,7 +489,9 @@ class Depth(Task):
                 return LABELS[goal]
         return OUT_OF_SHAPE
 
-    def marks(self, output: Sequence[Map], truth: Distances) -> list[list[tasks.Mark]]:
+    def marks(
+        self, output: Sequence[DepthMap], truth: DepthTruth
+    ) -> list[list[tasks.Mark]]:
         """See `Task.marks`: the object, its pixels whose distance is right, and the
         disparity of everything.
         """
@@ -495,12 +504,12 @@ class Depth(Task):
             kind = self.kind or next(iter(depth_map))
             # Whether the fit is reliable does not matter for what is drawn.
             missing = self._missing(kind, truth if kind == METRIC else None)
-            if truth.seen and not missing:
+            if truth.is_visible and not missing:
                 marks.append(self._predicted_mark(depth_map, truth))
             marks_of_images.append(marks)
         return marks_of_images
 
-    def _predicted_mark(self, depth_map: Map, truth: Distances) -> tasks.Mark:
+    def _predicted_mark(self, depth_map: DepthMap, truth: DepthTruth) -> tasks.Mark:
         """Return the predicted disparity, with the object's pixels that are right."""
         log_factors = self._log_factors(depth_map, truth).detach()
         is_right = torch.zeros_like(truth.mask)
@@ -511,7 +520,7 @@ class Depth(Task):
         if is_inverse:
             disparity = predicted
         else:
-            disparity = predicted.clamp_min(1.0 / LARGEST).reciprocal()
+            disparity = predicted.clamp_min(1.0 / MAX_FACTOR).reciprocal()
         return tasks.Mark(
             "disparity", False, mask=is_right, map=disparity.detach().cpu()
         )

@@ -20,38 +20,38 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
-from advsearch.models.labels import names_nothing
+from advsearch.models.labels import is_nothing_name
 from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW, OUTCOME, Outcome
 from advsearch.tasks import detector_outputs as outputs
-from advsearch.tasks.base import Facts, Mark, Prediction, Said
+from advsearch.tasks.base import Facts, Mark, Prediction, PredictionWithPayload
 from advsearch.tasks.boxes import (
+    DECLARED_FORMAT_ATTRIBUTE,
     FORMS,
-    KNOWN,
-    LEAST_OVERLAP,
-    SMALLEST,
+    MIN_OVERLAP,
+    MIN_PROBABILITY,
     UNITS,
+    BoxFormat,
     Detections,
-    Place,
-    Reading,
-    as_option,
-    best_of,
-    listed,
-    log_odds,
-    numbers_of,
-    overlap,
-    overlap_with,
-    share_inside,
-    strongest_boxes,
-    suppressed,
-    unit_in,
+    DetectionTruth,
+    compute_fraction_inside,
+    compute_iou,
+    compute_iou_with_truth,
+    compute_log_odds,
+    format_option,
+    get_box_numbers,
+    infer_unit,
+    list_boxes,
+    max_or_zero,
+    select_best_boxes,
+    suppress,
 )
-from advsearch.tasks.classification import NO, ClassTask, Labels
+from advsearch.tasks.classification import MISSED_PREFIX, ClassTask, Labels
 from advsearch.tasks.detector_outputs import (
-    ASK_ORDER,
+    CLASS_COUNT_ORDERS,
     HEADS,
     LAYOUTS,
+    ORDER_ADVICE,
     QUERIES,
-    TOLD_BY_CLASSES,
 )
 
 GOALS = {
@@ -63,25 +63,25 @@ GOALS = {
 }
 """What an attack may seek, by the name of the objective."""
 
-MOST = 8
-LEAST = 0.1
+MAX_STORED_BOXES = 8
+MIN_SCORE = 0.1
 """Maximum number of boxes stored per image; minimum score of a box that is stored or
 takes part in suppression.
 """
 
 # A box of which this fraction lies on the object is on it, whatever its overlap.
-ON_IT = 0.5
+MIN_FRACTION_INSIDE = 0.5
 
 LABELS = {
     Outcome.LOOSE: "{} in a loose box",
     Outcome.PHANTOM: "{} elsewhere",
-    Outcome.MISSED: f"{NO}{{}}",
+    Outcome.MISSED: f"{MISSED_PREFIX}{{}}",
 }
 """Label of a prediction by its outcome; other outcomes are labelled by their class."""
 
 
 @dataclass(frozen=True)
-class Finding:
+class ObjectMatch:
     """What becomes of the object in the detections of one image.
 
     Attributes:
@@ -148,7 +148,7 @@ class Detection(ClassTask):
     head_shape: tuple[int, ...] | None = field(default=None, metadata=FROM_RUN)
     # The outputs contain mask coefficients, which are ignored.
     ignores_masks: bool = field(default=False, metadata=FROM_RUN)
-    # The network declares the format of its boxes, see `KNOWN`.
+    # The network declares the format of its boxes, see `DECLARED_FORMAT_ATTRIBUTE`.
     has_declared_format: bool = field(default=False, metadata=FROM_RUN)
     # The model fills its output with rows of NaN when it detects nothing.
     fills_with_nan: bool = field(default=False, metadata=FROM_RUN)
@@ -167,7 +167,7 @@ class Detection(ClassTask):
             lambda value: 0.0 < value <= 1.0, "a number over 0, up to 1", "suppression"
         )
         try:
-            outputs.checked_order(self.order or outputs.ORDERS[0])
+            outputs.parse_order(self.order or outputs.ORDERS[0])
         except ValueError as error:
             raise InputError(f"task detection: order: {error}") from None
         self._check_choice("boxes", ("", *FORMS))
@@ -203,7 +203,9 @@ class Detection(ClassTask):
             output = model(noise)
         fills_with_nan = any("blank" in detections for detections in output)
         has_format_options = bool(self.boxes or self.unit)
-        is_declared = not has_format_options and getattr(model.module, KNOWN, False)
+        is_declared = not has_format_options and getattr(
+            model.module, DECLARED_FORMAT_ATTRIBUTE, False
+        )
         task = replace(
             task,
             input_size=model.input_size,
@@ -219,7 +221,7 @@ class Detection(ClassTask):
         return not knows_format or needs_order
 
     def after_calibration(
-        self, output: Sequence[Detections], truth: Place | None
+        self, output: Sequence[Detections], truth: DetectionTruth | None
     ) -> Detection:
         """See `Task.after_calibration`: note what is odd about the boxes.
 
@@ -228,19 +230,21 @@ class Detection(ClassTask):
         """
         task = self._infer_format(output)
         output = task._resolve_grids(output)
-        box_format = task._reading
-        if truth is not None and truth.shares is not None:
+        box_format = task._box_format
+        if truth is not None and truth.box_fractions is not None:
             right_boxes = task._find_boxes_of_classes(output, truth.labels)
             if len(right_boxes):
-                better_format = box_format.better(right_boxes, truth.shares, self.iou)
+                better_format = box_format.suggest_better_format(
+                    right_boxes, truth.box_fractions, self.iou
+                )
                 if better_format:
                     doubts = f"one of them is nearer to the object with {better_format}"
                 else:
-                    doubts = box_format.fault(right_boxes)
+                    doubts = box_format.describe_fault(right_boxes)
                 return replace(task, doubts=doubts)
-        boxes = strongest_boxes(output)
-        fault = box_format.fault(boxes)
-        doubts = fault and f"{fault}{box_format.instead(boxes)}"
+        boxes = select_best_boxes(output)
+        fault = box_format.describe_fault(boxes)
+        doubts = fault and f"{fault}{box_format.suggest_plausible_formats(boxes)}"
         return replace(task, doubts=doubts)
 
     def _find_boxes_of_classes(
@@ -250,7 +254,7 @@ class Detection(ClassTask):
         selected = []
         for detections in self._resolve_labels(output):
             scores = self._scores_of_classes(detections, classes)
-            selected.append(detections["boxes"][scores >= LEAST])
+            selected.append(detections["boxes"][scores >= MIN_SCORE])
         return torch.cat(selected)
 
     def _infer_format(self, output: Sequence[Detections]) -> Detection:
@@ -270,7 +274,7 @@ class Detection(ClassTask):
         if self.has_declared_format:
             unit = UNITS[1]
         else:
-            unit = unit_in(strongest_boxes(resolved)) or self.inferred_unit
+            unit = infer_unit(select_best_boxes(resolved)) or self.inferred_unit
         has_nan_rows = any(
             "blank" in detections and len(detections["boxes"])
             for detections in resolved
@@ -290,15 +294,15 @@ class Detection(ClassTask):
         grids = [detections["raw"] for detections in output if "raw" in detections]
         has_logits = any("logits" in detections for detections in output)
         head = self._head
-        if not head and has_logits and self.named and names_nothing(self.labels[-1]):
+        if not head and has_logits and self.named and is_nothing_name(self.labels[-1]):
             head = QUERIES[1]
         n_classes = len(self.labels) if self.named else None
         try:
-            return outputs.order_in(output, n_classes, head)
+            return outputs.infer_order(output, n_classes, head)
         except ValueError as error:
             shape = f"the model's output is {tuple(grids[0].shape)}: " if grids else ""
             is_ambiguous = any("either" in detections for detections in output)
-            hint = f"; {ASK_ORDER}" if is_ambiguous else ""
+            hint = f"; {ORDER_ADVICE}" if is_ambiguous else ""
             raise InputError(f"task detection: {shape}{error}{hint}") from None
 
     def _has_mask_coefficients(self, output: Sequence[Detections], order: str) -> bool:
@@ -327,14 +331,14 @@ class Detection(ClassTask):
         if self.is_order_ambiguous and not (self.order or self.inferred_order):
             return (
                 "order: expected what tells scores from classes, and no output of "
-                f"the model does; {ASK_ORDER}"
+                f"the model does; {ORDER_ADVICE}"
             )
         if not (self.unit or self.inferred_unit):
             return (
                 "unit: expected the unit of the model's boxes, and it finds nothing in "
                 "noise and in the clean scene "
-                f"that shows it; say {as_option('unit: fractions')} or "
-                f"{as_option('unit: pixels')}, and `boxes` too "
+                f"that shows it; say {format_option('unit: fractions')} or "
+                f"{format_option('unit: pixels')}, and `boxes` too "
                 "unless they are x0, y0, x1, y1"
             )
         return ""
@@ -342,7 +346,7 @@ class Detection(ClassTask):
     @property
     def remarks(self) -> tuple[str, ...]:
         remarks = []
-        order = as_option(f"order: {self.inferred_order}")
+        order = format_option(f"order: {self.inferred_order}")
         is_order_inferred = not self.order
         if self.head_shape and is_order_inferred:
             remarks.append(
@@ -364,54 +368,56 @@ class Detection(ClassTask):
         return tuple(remarks)
 
     @property
-    def _reading(self) -> Reading:
+    def _box_format(self) -> BoxFormat:
         """How the model's boxes are read: by the options, else as inferred."""
         order = self._head or self.inferred_order
-        default_form = "cxcywh" if order in TOLD_BY_CLASSES else FORMS[0]
+        default_form = "cxcywh" if order in CLASS_COUNT_ORDERS else FORMS[0]
         unit = self.unit or self.inferred_unit or UNITS[1]
-        return Reading(self.boxes or default_form, unit, self.input_size)
+        return BoxFormat(self.boxes or default_form, unit, self.input_size)
 
     @property
     def _head(self) -> str:
         """The head of `HEADS` or `QUERIES` that the option `order` names; "" if none."""
         if not self.order:
             return ""
-        order = " ".join(outputs.checked_order(self.order))
-        return order if order in TOLD_BY_CLASSES else ""
+        order = " ".join(outputs.parse_order(self.order))
+        return order if order in CLASS_COUNT_ORDERS else ""
 
-    def seeking(self, objective: str) -> Detection:
+    def with_objective(self, objective: str) -> Detection:
         return replace(self, seek=objective) if objective in GOALS else self
 
     def read(self, prediction: Any, count: int) -> list[Detections]:
-        return outputs.detections_in(prediction, count, self.order)
+        return outputs.read_detections(prediction, count, self.order)
 
-    def classes_in(self, output: Sequence[Detections]) -> int | None:
+    def count_classes(self, output: Sequence[Detections]) -> int | None:
         scores = output[0].get("scores")
         return scores.shape[1] if scores is not None and scores.ndim == 2 else None
 
-    def truth(self, facts: Facts) -> Place:
+    def truth(self, facts: Facts) -> DetectionTruth:
         """See `Task.truth`: the true box, and those of other things of its classes."""
         height, width = facts.mask.shape
-        right_classes = self.right_classes(facts)
+        right_classes = self.find_right_classes(facts)
         other_boxes = []
         for other in facts.others:
             if self._has_class(other, right_classes) and other.box is not None:
                 other_boxes.append(other.box)
-        return Place(right_classes, facts.box, (height, width), tuple(other_boxes))
+        return DetectionTruth(
+            right_classes, facts.box, (height, width), tuple(other_boxes)
+        )
 
     def _has_class(self, facts: Facts, classes: Labels) -> bool:
         """Whether a thing's own label is one of these classes of the model."""
         try:
-            return not set(classes).isdisjoint(self.right_classes(facts))
+            return not set(classes).isdisjoint(self.find_right_classes(facts))
         except InputError:  # it has no label, or none that the model knows
             return False
 
-    def truth_names(self, truth: Place) -> tuple[str, ...]:
-        return self.names(truth.labels)
+    def truth_names(self, truth: DetectionTruth) -> tuple[str, ...]:
+        return self.get_class_names(truth.labels)
 
     # ---- loss and score ----
 
-    def loss(self, output: Sequence[Detections], truth: Place) -> Tensor:
+    def loss(self, output: Sequence[Detections], truth: DetectionTruth) -> Tensor:
         """Compute by how much the best right box is below `confidence`, in log-odds.
 
         Returns:
@@ -427,14 +433,14 @@ class Detection(ClassTask):
             lambda detections: loss_of_image(self._suppress(detections), truth),
         )
 
-    def score(self, output: Sequence[Detections], truth: Place) -> Tensor:
+    def score(self, output: Sequence[Detections], truth: DetectionTruth) -> Tensor:
         """Compute how near each output is to what is sought, (N,), in log-odds.
 
         It is over 0 if the output is a success.
         """
         if self.minimise:
             return -self.loss(output, truth)
-        score_by_goal: dict[str, Callable[[Detections, Place], Tensor]] = {
+        score_by_goal: dict[str, Callable[[Detections, DetectionTruth], Tensor]] = {
             "vanish": self._score_vanish,
             "mislabel": self._score_mislabel,
             "displace": self._score_displace,
@@ -448,7 +454,7 @@ class Detection(ClassTask):
     def _map_images(
         self,
         output: Sequence[Detections],
-        truth: Place,
+        truth: DetectionTruth,
         function: Callable[[Detections], Tensor],
     ) -> Tensor:
         """Apply a function to the detections of each image, (N,).
@@ -458,7 +464,7 @@ class Detection(ClassTask):
         """
         is_out_of_view = truth.box is None and self.seek != "create"
         values = []
-        for detections in self._read(output):
+        for detections in self._read_boxes(output):
             if self._is_broken(detections):
                 value = detections["scores"].sum() * math.nan
             elif is_out_of_view:
@@ -469,43 +475,43 @@ class Detection(ClassTask):
             values.append(value)
         return torch.stack(values)
 
-    def _score_vanish(self, detections: Detections, truth: Place) -> Tensor:
+    def _score_vanish(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Compute by how much the best right box at the object is below `confidence`."""
         right_score = self._scores_of_classes(detections, truth.labels)
-        best_score = best_of(right_score, self._is_at_object(detections, truth))
-        return self._min_log_odds - log_odds(best_score)
+        best_score = max_or_zero(right_score, self._is_at_object(detections, truth))
+        return self._min_log_odds - compute_log_odds(best_score)
 
-    def _score_mislabel(self, detections: Detections, truth: Place) -> Tensor:
+    def _score_mislabel(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Compute the lesser of two: that the object vanishes, and that a box at it has a
         wrong class.
         """
         wrong_score = self._scores_of_rivals(self._suppress(detections), truth.labels)
-        best_score = best_of(wrong_score, self._is_at_object(detections, truth))
-        wrong_lead = log_odds(best_score) - self._min_log_odds
+        best_score = max_or_zero(wrong_score, self._is_at_object(detections, truth))
+        wrong_lead = compute_log_odds(best_score) - self._min_log_odds
         return torch.minimum(self._score_vanish(detections, truth), wrong_lead)
 
-    def _score_displace(self, detections: Detections, truth: Place) -> Tensor:
+    def _score_displace(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Compute the lesser of two: how far the best overlap of a box that counts is
         below `iou`, and that some box counts.
 
         The first is scaled so that a small step from `iou` is as long as one in log-odds.
         """
         scores = self._scores_of_classes(detections, truth.labels)
-        score_lead = log_odds(best_of(scores)) - self._min_log_odds
-        best_overlap = best_of(
-            overlap_with(detections, truth), scores >= self.confidence
+        score_lead = compute_log_odds(max_or_zero(scores)) - self._min_log_odds
+        best_overlap = max_or_zero(
+            compute_iou_with_truth(detections, truth), scores >= self.confidence
         )
         overlap_lead = (self.iou - best_overlap) / (self.iou * (1.0 - self.iou))
         return torch.minimum(overlap_lead, score_lead)
 
-    def _score_create(self, detections: Detections, truth: Place) -> Tensor:
+    def _score_create(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Compute by how much the best box where nothing is exceeds `confidence`."""
         phantom_score = self._phantom_scores(self._suppress(detections), truth)
-        return log_odds(best_of(phantom_score)) - self._min_log_odds
+        return compute_log_odds(max_or_zero(phantom_score)) - self._min_log_odds
 
-    def _is_at_object(self, detections: Detections, truth: Place) -> Tensor:
+    def _is_at_object(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Which boxes fit the true box, (D,) bool."""
-        return overlap_with(detections, truth) >= self.iou
+        return compute_iou_with_truth(detections, truth) >= self.iou
 
     @property
     def _min_log_odds(self) -> float:
@@ -519,23 +525,23 @@ class Detection(ClassTask):
         n_classes = len(self.labels) or None
         try:
             return [
-                outputs.settled(detections, self.inferred_order, n_classes)
+                outputs.resolve_detections(detections, self.inferred_order, n_classes)
                 for detections in output
             ]
         except ValueError as error:
             raise InputError(f"task detection: {error}") from None
 
-    def _read(self, output: Sequence[Detections]) -> list[Detections]:
+    def _read_boxes(self, output: Sequence[Detections]) -> list[Detections]:
         """Return the detections of each image with boxes as fractions of the image.
 
         Classes that stand for nothing get a score of 0. Boxes that are not finite are
         dropped if all their scores are below the minimum.
         """
         images = list[Detections]()
-        box_format = self._reading
-        nothing_classes = torch.tensor(self.nothing, dtype=torch.long)
+        box_format = self._box_format
+        nothing_classes = torch.tensor(self.nothing_classes, dtype=torch.long)
         for detections in self._resolve_labels(output):
-            boxes = box_format.fractions(detections["boxes"])
+            boxes = box_format.to_fractions(detections["boxes"])
             scores = detections["scores"]
             if "labels" in detections:
                 is_nothing = torch.isin(
@@ -546,7 +552,7 @@ class Detection(ClassTask):
                 scores = scores.index_fill(1, nothing_classes.to(scores.device), 0.0)
             resolved = {**detections, "boxes": boxes, "scores": scores}
             is_finite = boxes.detach().isfinite().all(dim=1)
-            is_weak = (numbers_of(resolved) < self._min_score).all(dim=1)
+            is_weak = (get_box_numbers(resolved) < self._min_score).all(dim=1)
             counts = is_finite | ~is_weak
             if not bool(counts.all()):
                 resolved = {
@@ -559,7 +565,7 @@ class Detection(ClassTask):
     @property
     def _min_score(self) -> float:
         """The minimum score of a box that is stored or takes part in suppression."""
-        return min(LEAST, self.confidence)
+        return min(MIN_SCORE, self.confidence)
 
     def _is_broken(self, detections: Detections) -> bool:
         """Whether a score or a box that counts is not finite, or all rows are NaN although
@@ -575,40 +581,45 @@ class Detection(ClassTask):
 
     def _suppress(self, detections: Detections) -> Detections:
         """Apply non-maximum suppression with the options of the task."""
-        return suppressed(detections, self._min_score, self.suppression)
+        return suppress(detections, self._min_score, self.suppression)
 
-    def _is_elsewhere(self, detections: Detections, truth: Place) -> Tensor:
+    def _is_elsewhere(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Which boxes neither fit the object nor lie mostly inside its box, (D,) bool."""
         boxes = detections["boxes"]
-        if truth.shares is None:
+        if truth.box_fractions is None:
             return torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
-        is_mostly_outside = share_inside(boxes, truth.shares.to(boxes)) < ON_IT
+        is_mostly_outside = (
+            compute_fraction_inside(boxes, truth.box_fractions.to(boxes))
+            < MIN_FRACTION_INSIDE
+        )
         return is_mostly_outside & ~self._is_at_object(detections, truth)
 
     @staticmethod
-    def _is_on(boxes: Tensor, true_box: Tensor) -> Tensor:
+    def _are_on(boxes: Tensor, true_box: Tensor) -> Tensor:
         """Which boxes (D, 4) are on a thing with a true box (4,), however loosely, (D,)
         bool.
         """
-        overlaps = overlap(boxes, true_box) >= LEAST_OVERLAP
-        lies_inside = share_inside(boxes, true_box) >= ON_IT
+        overlaps = compute_iou(boxes, true_box) >= MIN_OVERLAP
+        lies_inside = compute_fraction_inside(boxes, true_box) >= MIN_FRACTION_INSIDE
         return overlaps | lies_inside
 
-    def _is_loosely_on_object(self, detections: Detections, truth: Place) -> Tensor:
+    def _is_loosely_on_object(
+        self, detections: Detections, truth: DetectionTruth
+    ) -> Tensor:
         """Which boxes are on the object and fit no other thing of its class better, (D,)
         bool.
         """
         boxes = detections["boxes"]
-        true_box = truth.shares
+        true_box = truth.box_fractions
         assert true_box is not None
-        is_on_object = self._is_on(boxes, true_box.to(boxes))
-        object_overlap = overlap_with(detections, truth)
+        is_on_object = self._are_on(boxes, true_box.to(boxes))
+        object_overlap = compute_iou_with_truth(detections, truth)
         for other_box in truth.others:
-            other_overlap = overlap(boxes, truth.fractions_of(other_box).to(boxes))
+            other_overlap = compute_iou(boxes, truth.to_fractions(other_box).to(boxes))
             is_on_object = is_on_object & (object_overlap >= other_overlap)
         return is_on_object
 
-    def _is_on_nothing(self, detections: Detections, truth: Place) -> Tensor:
+    def _is_on_nothing(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Which boxes are on no thing of the right classes, the object included, (D,)
         bool.
         """
@@ -618,11 +629,11 @@ class Detection(ClassTask):
             true_boxes.insert(0, truth.box)
         is_on_nothing = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
         for true_box in true_boxes:
-            is_on_thing = self._is_on(boxes, truth.fractions_of(true_box).to(boxes))
+            is_on_thing = self._are_on(boxes, truth.to_fractions(true_box).to(boxes))
             is_on_nothing = is_on_nothing & ~is_on_thing
         return is_on_nothing
 
-    def _phantom_scores(self, detections: Detections, truth: Place) -> Tensor:
+    def _phantom_scores(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Return the score of each box as one where nothing is, (D,).
 
         The score is that of a target class, or of any class without a target. A loose box
@@ -679,24 +690,27 @@ class Detection(ClassTask):
     ) -> list[tuple[Prediction, ...]]:
         """See `Task.predictions`: the boxes with the best scores."""
         predictions_of_images: list[tuple[Prediction, ...]] = []
-        for detections in self._read(output):
+        for detections in self._read_boxes(output):
             if self._is_broken(detections):
                 predictions_of_images.append((Prediction(NOT_A_NUMBER),))
                 continue
-            boxes = listed(detections, count, SMALLEST, self.suppression)
+            boxes = list_boxes(detections, count, MIN_PROBABILITY, self.suppression)
             predictions = tuple(
-                Prediction(self.name_of(label), label, score)
+                Prediction(self.get_class_name(label), label, score)
                 for _, label, score in boxes
             )
             predictions_of_images.append(predictions or (Prediction("nothing"),))
         return predictions_of_images
 
-    def said(
-        self, output: Sequence[Detections], truth: Place, margins: Sequence[float]
-    ) -> list[Said]:
+    def describe(
+        self,
+        output: Sequence[Detections],
+        truth: DetectionTruth,
+        margins: Sequence[float],
+    ) -> list[PredictionWithPayload]:
         """See `Task.said`: what becomes of the object; the payload has boxes in pixels."""
-        results: list[Said] = []
-        for detections in self._read(output):
+        results: list[PredictionWithPayload] = []
+        for detections in self._read_boxes(output):
             finding = self._match_object(self._suppress(detections), truth)
             payload: dict[str, JsonValue] = {
                 "box": None if truth.box is None else list(truth.box),
@@ -704,18 +718,20 @@ class Detection(ClassTask):
             }
             if finding.outcome is not None:
                 payload[OUTCOME] = finding.outcome.value
-                payload["class"] = self.name_of(finding.index)
+                payload["class"] = self.get_class_name(finding.index)
                 payload["iou"] = None if finding.iou is None else round(finding.iou, 3)
-            results.append((self._describe(finding, truth), payload))
+            results.append((self._describe_match(finding, truth), payload))
         return results
 
-    def _boxes_in_pixels(self, detections: Detections, truth: Place) -> list[JsonValue]:
+    def _boxes_in_pixels(
+        self, detections: Detections, truth: DetectionTruth
+    ) -> list[JsonValue]:
         """Return the best boxes of an image as they are stored in rows."""
         height, width = truth.size
         scale = [width, height] * 2
         boxes: list[JsonValue] = []
-        for box, label, score in listed(
-            detections, MOST, self._min_score, self.suppression
+        for box, label, score in list_boxes(
+            detections, MAX_STORED_BOXES, self._min_score, self.suppression
         ):
             pixels: list[JsonValue] = [
                 round(fraction * size, 1)
@@ -724,29 +740,31 @@ class Detection(ClassTask):
             boxes.append(
                 {
                     "box": pixels,
-                    "label": self.name_of(label),
+                    "label": self.get_class_name(label),
                     "score": round(score, 3),
                 }
             )
         return boxes
 
-    def _match_object(self, detections: Detections, truth: Place) -> Finding:
+    def _match_object(
+        self, detections: Detections, truth: DetectionTruth
+    ) -> ObjectMatch:
         """Decide what becomes of the object in boxes that survived suppression."""
         right_score = self._scores_of_classes(detections, truth.labels)
         is_on_nothing = self._is_on_nothing(detections, truth)
         if self.seek == "create" and float(self._score_create(detections, truth)) > 0.0:
             phantom_score = self._phantom_scores(detections, truth)
             is_phantom = phantom_score > 0.0
-            return self._finding(
+            return self._match_best_box(
                 Outcome.PHANTOM, detections, phantom_score, is_phantom, truth
             )
         if truth.box is None:
-            best_phantom = float(best_of(right_score, is_on_nothing))
+            best_phantom = float(max_or_zero(right_score, is_on_nothing))
             if self.seek != "create" and best_phantom >= self.confidence:
-                return self._finding(
+                return self._match_best_box(
                     Outcome.PHANTOM, detections, right_score, is_on_nothing, truth
                 )
-            return Finding(None, truth.labels[0])
+            return ObjectMatch(None, truth.labels[0])
         is_at_object = self._is_at_object(detections, truth)
         is_loose = self._is_loosely_on_object(detections, truth) & ~is_at_object
         wrong_score = self._scores_of_rivals(detections, truth.labels)
@@ -757,23 +775,25 @@ class Detection(ClassTask):
             (Outcome.PHANTOM, right_score, is_on_nothing),
         )
         for outcome, scores, is_candidate in candidates:
-            if float(best_of(scores, is_candidate)) >= self.confidence:
-                return self._finding(outcome, detections, scores, is_candidate, truth)
-        best_score = float(best_of(right_score, is_at_object))
-        return Finding(
+            if float(max_or_zero(scores, is_candidate)) >= self.confidence:
+                return self._match_best_box(
+                    outcome, detections, scores, is_candidate, truth
+                )
+        best_score = float(max_or_zero(right_score, is_at_object))
+        return ObjectMatch(
             Outcome.MISSED,
             truth.labels[0],
             best_score if math.isfinite(best_score) else None,
         )
 
     @staticmethod
-    def _finding(
+    def _match_best_box(
         outcome: Outcome,
         detections: Detections,
         scores: Tensor,
         is_candidate: Tensor,
-        truth: Place,
-    ) -> Finding:
+        truth: DetectionTruth,
+    ) -> ObjectMatch:
         """Return an outcome with the best box among the candidates."""
         row = int(torch.where(is_candidate, scores, -1.0).argmax())
         score = float(scores[row])
@@ -783,12 +803,14 @@ class Detection(ClassTask):
             class_id = int((detections["scores"][row] == score).nonzero()[0])
         iou = None
         if truth.box is not None:
-            iou = float(overlap_with(detections, truth)[row])
-        return Finding(outcome, class_id, score, iou)
+            iou = float(compute_iou_with_truth(detections, truth)[row])
+        return ObjectMatch(outcome, class_id, score, iou)
 
-    def _describe(self, finding: Finding, truth: Place) -> Prediction:
+    def _describe_match(
+        self, finding: ObjectMatch, truth: DetectionTruth
+    ) -> Prediction:
         """Return the prediction about the object, with the score of the deciding box."""
-        class_name = self.name_of(finding.index)
+        class_name = self.get_class_name(finding.index)
         if finding.outcome is None or (truth.box is None and self.seek != "create"):
             return Prediction(OUT_OF_VIEW)
         if finding.outcome in LABELS:
@@ -796,26 +818,32 @@ class Detection(ClassTask):
             return Prediction(label, None, finding.score)
         return Prediction(class_name, finding.index, finding.score)
 
-    def marks(self, output: Sequence[Detections], truth: Place) -> list[list[Mark]]:
+    def marks(
+        self, output: Sequence[Detections], truth: DetectionTruth
+    ) -> list[list[Mark]]:
         """See `Task.marks`: the true box, and every box with a score of `confidence`."""
         true_marks = []
         if truth.box is not None:
-            true_name = " or ".join(self.names(truth.labels))
+            true_name = " or ".join(self.get_class_names(truth.labels))
             true_marks.append(Mark(true_name, True, box=truth.box))
         return [
             [*true_marks, *self._predicted_marks(detections, truth)]
-            for detections in self._read(output)
+            for detections in self._read_boxes(output)
         ]
 
-    def _predicted_marks(self, detections: Detections, truth: Place) -> list[Mark]:
+    def _predicted_marks(
+        self, detections: Detections, truth: DetectionTruth
+    ) -> list[Mark]:
         """Return a mark for every box of an image with a score of `confidence`."""
         if self._is_broken(detections):
             return []
         height, width = truth.size
         marks = []
-        for (x0, y0, x1, y1), label, score in listed(
-            detections, MOST, self.confidence, self.suppression
+        for (x0, y0, x1, y1), label, score in list_boxes(
+            detections, MAX_STORED_BOXES, self.confidence, self.suppression
         ):
             box = (x0 * width, y0 * height, x1 * width, y1 * height)
-            marks.append(Mark(f"{self.name_of(label)} {score:.2f}", False, box=box))
+            marks.append(
+                Mark(f"{self.get_class_name(label)} {score:.2f}", False, box=box)
+            )
         return marks

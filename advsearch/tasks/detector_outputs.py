@@ -27,9 +27,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.models.labels import sets_of
-from advsearch.models.model import tensors_in
-from advsearch.tasks.boxes import Detections, as_option, counted, nowhere
+from advsearch.models.labels import list_sets_of_size
+from advsearch.models.model import list_tensors
+from advsearch.tasks.boxes import Detections, are_counted, are_invalid, format_option
 
 EXPECTED = (
     "expected boxes (N, D, 4) and scores (N, D, classes); boxes (N, D, 4), labels (N, "
@@ -55,10 +55,10 @@ HEADS = {"boxes scores": 4, "boxes objectness scores": 5}
 """Channels of a YOLO head, and the index of the first score among them."""
 
 LAYOUTS = ("channels first", "channels last")
-OF_HEADS = frozenset(
+HEAD_ORDERS = frozenset(
     [*HEADS, *(f"{head} {layout}" for head in HEADS for layout in LAYOUTS)]
 )
-TOLD_BY_CLASSES = OF_HEADS | frozenset(QUERIES)
+CLASS_COUNT_ORDERS = HEAD_ORDERS | frozenset(QUERIES)
 """Orders that the number of classes explains; their boxes are center, width, height."""
 
 TOLERANCE = 1e-3  # how far outside [0, 1] a score may lie
@@ -108,13 +108,15 @@ WORDS = {
 }
 """Substrings that identify a component whose name is none of `NAMES`."""
 
-ASK_ORDER = f"say {' or '.join(as_option(f'order: {order}') for order in ORDERS)}"
+ORDER_ADVICE = (
+    f"say {' or '.join(format_option(f'order: {order}') for order in ORDERS)}"
+)
 """Advice of messages if scores and classes cannot be distinguished."""
 
-NOTHING: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
+NO_DETECTIONS: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
 
 
-def checked_order(text: str) -> tuple[str, ...]:
+def parse_order(text: str) -> tuple[str, ...]:
     """Parse the names in an order and check them.
 
     They are boxes, scores and labels, and optionally "batch" for the index of the
@@ -125,7 +127,7 @@ def checked_order(text: str) -> tuple[str, ...]:
         ValueError: it is none of these.
     """
     names = tuple(text.replace(",", " ").split())
-    if " ".join(names) in TOLD_BY_CLASSES:
+    if " ".join(names) in CLASS_COUNT_ORDERS:
         return names
     if sorted(names) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
         raise ValueError(
@@ -138,18 +140,18 @@ def checked_order(text: str) -> tuple[str, ...]:
     return names
 
 
-def detections_in(returned: Any, count: int, order: str = "") -> list[Detections]:
+def read_detections(returned: Any, count: int, order: str = "") -> list[Detections]:
     """Read the detections of each of `count` images from what a detector returned.
 
     Args:
         returned: by the network, in one of the forms of `EXPECTED`.
         count: number of images.
-        order: of components without names, see `checked_order`; "" to infer it.
+        order: of components without names, see `parse_order`; "" to infer it.
 
     Raises:
         ValueError: it has another form, or scores are not in [0, 1].
     """
-    order_names = checked_order(order) if order else ()
+    order_names = parse_order(order) if order else ()
     order = " ".join(order_names)
     is_sequence = isinstance(returned, (list, tuple)) and len(returned) > 0
     if is_sequence and all(isinstance(x, Tensor) and x.ndim > 3 for x in returned):
@@ -176,14 +178,14 @@ def detections_in(returned: Any, count: int, order: str = "") -> list[Detections
         and bool((returned[..., 5] == returned[..., 5].round()).all())
     )
     is_rows = bool(order_names) or is_rows_with_masks
-    if is_grid and (order in OF_HEADS or not (is_rows or returned.shape[2] == 6)):
+    if is_grid and (order in HEAD_ORDERS or not (is_rows or returned.shape[2] == 6)):
         return [
             {"raw": grid.float(), "map_channels": map_channels} for grid in returned
         ]
     if is_rows_with_masks:
         return [
             {**detections, "map_channels": map_channels}
-            for detections in detections_in(returned[..., :6], count, order)
+            for detections in read_detections(returned[..., :6], count, order)
         ]
     if "objectness" in order_names or "channels" in order_names:
         raise ValueError(EXPECTED)
@@ -220,7 +222,9 @@ def _split_images(
         and all(map(_is_image_output, returned))
     ):
         return [
-            dict(NOTHING) if output is None else _find_components(output, order_names)
+            dict(NO_DETECTIONS)
+            if output is None
+            else _find_components(output, order_names)
             for output in returned
         ]
     if isinstance(returned, Tensor) and returned.ndim == 2 and returned.shape[1] == 7:
@@ -318,7 +322,7 @@ def _split_off_maps(returned: Any) -> tuple[Any, set[int]]:
         return returned, set()
     channels = {
         tensor.shape[1]
-        for tensor in tensors_in(list(rest))
+        for tensor in list_tensors(list(rest))
         if tensor.ndim == 4 and len(tensor) == len(predictions)
     }
     return predictions, channels
@@ -486,7 +490,7 @@ def _checked_detections(components: Mapping[str, Tensor]) -> Detections:
     if "either" in components:
         either = components["either"].float()
         has_scores = (either.detach() > 0.0).all(dim=1)
-        is_padding = nowhere(boxes.detach()) & ~has_scores
+        is_padding = are_invalid(boxes.detach()) & ~has_scores
         return _without_padding(
             {"boxes": boxes, "either": either}, is_padding, either.detach()
         )
@@ -495,7 +499,7 @@ def _checked_detections(components: Mapping[str, Tensor]) -> Detections:
     values = scores.detach() if labels is None else scores.detach()[:, None]
     has_score = (values > 0.0).any(dim=1)
     is_marked = (values == -1.0).all(dim=1)
-    is_padding = (nowhere(boxes.detach()) & ~has_score) | is_marked
+    is_padding = (are_invalid(boxes.detach()) & ~has_score) | is_marked
     if labels is not None:
         is_padding = is_padding | (labels < 0)
     _check_probabilities(values[~is_padding], has_labels=labels is not None)
@@ -539,7 +543,7 @@ def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
         return
     advice = ""
     if not has_labels:
-        options = " or ".join(as_option(f"order: {order}") for order in QUERIES)
+        options = " or ".join(format_option(f"order: {order}") for order in QUERIES)
         advice = f", or say {options}"
     raise ValueError(
         "expected scores that are probabilities in [0, 1]; apply a sigmoid or a "
@@ -566,7 +570,7 @@ def _without_padding(
 # ---- scores and classes by their values ----
 
 
-def settled(
+def resolve_detections(
     detections: Detections, order: str = "", classes: int | None = None
 ) -> Detections:
     """Return the detections of an image with boxes, scores and labels identified.
@@ -583,9 +587,9 @@ def settled(
     if "raw" in detections or "logits" in detections:
         if classes is None:
             raise ValueError(EXPECTED)
-        order = order or order_in([detections], classes)
+        order = order or infer_order([detections], classes)
         if "raw" in detections:
-            boxes, scores = split(detections["raw"], classes, order)
+            boxes, scores = split_grid(detections["raw"], classes, order)
         else:
             boxes = detections["boxes"]
             logits = detections["logits"]
@@ -600,15 +604,15 @@ def settled(
         }
 
     either = detections["either"]
-    order = order or order_in([detections], classes)
-    has_values = counted(detections) | either.isnan().any(dim=1)
+    order = order or infer_order([detections], classes)
+    has_values = are_counted(detections) | either.isnan().any(dim=1)
     if not order and not bool(has_values.any()):
         order = ORDERS[0]  # any order will do
     if not order:
         raise ValueError(
-            f"which of a box's two numbers is its score does not show; {ASK_ORDER}"
+            f"which of a box's two numbers is its score does not show; {ORDER_ADVICE}"
         )
-    if order in OF_HEADS:
+    if order in HEAD_ORDERS:
         has_objectness = "objectness" in order
         scores = either.prod(dim=1, keepdim=True) if has_objectness else either
         return _checked_detections({"boxes": detections["boxes"], "scores": scores})
@@ -622,8 +626,10 @@ def settled(
     return _checked_detections({**rest, "scores": scores, "labels": labels})
 
 
-def order_in(
-    found: Sequence[Detections], classes: int | None = None, head: str = ""
+def infer_order(
+    detections_of_images: Sequence[Detections],
+    classes: int | None = None,
+    head: str = "",
 ) -> str:
     """Infer the order that the detections of any images show.
 
@@ -632,7 +638,7 @@ def order_in(
     classes, or objectness and the score of the only class.
 
     Args:
-        found: detections of images.
+        detections_of_images: detections of images.
         classes: number of classes; None if it is unknown.
         head: one of `HEADS` or `QUERIES` that the user stated for outputs in one
             tensor, or "".
@@ -647,13 +653,13 @@ def order_in(
             the classes.
     """
     if classes is not None:
-        logits = [x["logits"] for x in found if "logits" in x]
+        logits = [x["logits"] for x in detections_of_images if "logits" in x]
         if logits:
             return _order_of_logits(logits[0].shape[1], classes, head)
-        grids = [x for x in found if "raw" in x]
+        grids = [x for x in detections_of_images if "raw" in x]
         if grids:
             return _order_of_grids(grids, classes, head)
-    return _order_of_pairs(found, classes)
+    return _order_of_pairs(detections_of_images, classes)
 
 
 def _order_of_logits(n_logits: int, classes: int, head: str) -> str:
@@ -662,7 +668,9 @@ def _order_of_logits(n_logits: int, classes: int, head: str) -> str:
     is_softmax = order == QUERIES[1]
     if n_logits == classes or (is_softmax and n_logits == classes + 1):
         return order
-    fitting_sets = dict.fromkeys([*sets_of(n_logits), *sets_of(n_logits - 1)])
+    fitting_sets = dict.fromkeys(
+        [*list_sets_of_size(n_logits), *list_sets_of_size(n_logits - 1)]
+    )
     fitting = [f"`labels={name}`" for name in fitting_sets]
     if fitting:
         advice = f"{' or '.join(fitting)} would fit"
@@ -677,23 +685,26 @@ def _order_of_logits(n_logits: int, classes: int, head: str) -> str:
 def _order_of_grids(grids: Sequence[Detections], classes: int, head: str) -> str:
     """Return the only head with layout that fits the grids of all images."""
     heads_of_images = [
-        set(head_in(x["raw"], x["map_channels"].tolist(), classes, head)) for x in grids
+        set(find_head_orders(x["raw"], x["map_channels"].tolist(), classes, head))
+        for x in grids
     ]
     heads = set.intersection(*heads_of_images)
     if not heads:
         raise ValueError("pictures do not agree about how its numbers are to be read")
     if len(heads) > 1:
-        options = " or ".join(as_option(f"order: {name}") for name in sorted(heads))
+        options = " or ".join(format_option(f"order: {name}") for name in sorted(heads))
         raise ValueError(f"how its numbers are to be read does not show; say {options}")
     return heads.pop()
 
 
-def _order_of_pairs(found: Sequence[Detections], classes: int | None) -> str:
+def _order_of_pairs(
+    detections_of_images: Sequence[Detections], classes: int | None
+) -> str:
     """Return the order of the two numbers of boxes in `either`, "" if it is open."""
     pairs_of_images = []
-    for detections in found:
+    for detections in detections_of_images:
         if "either" in detections:
-            pairs = detections["either"][counted(detections)]
+            pairs = detections["either"][are_counted(detections)]
             is_finite = pairs.isfinite().all(dim=1)
             pairs_of_images.append(pairs[is_finite].detach())
     if not any(map(len, pairs_of_images)):
@@ -709,7 +720,7 @@ def _order_of_pairs(found: Sequence[Detections], classes: int | None) -> str:
         if all(are_scores) and not has_integers and classes in (1, 2):
             return f"{list(HEADS)[2 - classes]} {LAYOUTS[1]}"
         if classes is not None:
-            return order_in(found)
+            return infer_order(detections_of_images)
         raise ValueError(
             "expected for each box a score in [0, 1] and the number of a "
             "class, got other numbers"
@@ -748,8 +759,8 @@ def _is_falling(pairs_of_images: Sequence[Tensor], column: int) -> bool:
 # multiplied, a score of each class, and mask coefficients.
 
 
-def head_in(
-    returned: Tensor, beside: Collection[int], classes: int, order: str = ""
+def find_head_orders(
+    returned: Tensor, map_channels: Collection[int], classes: int, order: str = ""
 ) -> tuple[str, ...]:
     """Return the orders that the output (A, B) of one image may have.
 
@@ -757,7 +768,7 @@ def head_in(
 
     Args:
         returned: the output.
-        beside: numbers of channels of feature maps that came with it, which may be
+        map_channels: numbers of channels of feature maps that came with it, which may be
             mask coefficients.
         classes: number of classes.
         order: one of `HEADS`, with or without a layout, that narrows the orders.
@@ -774,9 +785,13 @@ def head_in(
         for head, first_score in HEADS.items():
             name = f"{head} {layout}"
             n_masks = n_channels - first_score - classes
-            if order not in ("", head, name) or (n_masks and n_masks not in beside):
+            if order not in ("", head, name) or (
+                n_masks and n_masks not in map_channels
+            ):
                 continue
-            scores = split(returned, classes, name, multiplied=False)[1].detach()
+            scores = split_grid(returned, classes, name, multiply_objectness=False)[
+                1
+            ].detach()
             is_outside = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
             if not bool((is_outside & scores.isfinite()).any()):
                 orders.append(name)
@@ -814,7 +829,7 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
     fitting = [
         f"`labels={name}`"
         for first_score in HEADS.values()
-        for name in sets_of(n_channels - first_score)
+        for name in list_sets_of_size(n_channels - first_score)
     ]
     if fitting:
         return f"; {' or '.join(fitting)} would fit"
@@ -833,8 +848,8 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
     return "; give the `labels` of the model's classes"
 
 
-def split(
-    returned: Tensor, classes: int, order: str, *, multiplied: bool = True
+def split_grid(
+    returned: Tensor, classes: int, order: str, *, multiply_objectness: bool = True
 ) -> tuple[Tensor, Tensor]:
     """Split the output (A, B) of one image into boxes and scores; differentiable.
 
@@ -842,7 +857,7 @@ def split(
         returned: the output.
         classes: number of classes.
         order: one of `HEADS` with a layout.
-        multiplied: multiply the scores by objectness, if there is any.
+        multiply_objectness: multiply the scores by objectness, if there is any.
 
     Returns:
         Boxes (D, 4) and scores (D, classes); (D, 1 + classes), objectness first, if it
@@ -854,6 +869,6 @@ def split(
         return boxes, rows[:, 4 : 4 + classes]
     objectness = rows[:, 4:5]
     scores = rows[:, 5 : 5 + classes]
-    if multiplied:
+    if multiply_objectness:
         return boxes, objectness * scores
     return boxes, torch.cat([objectness, scores], dim=1)

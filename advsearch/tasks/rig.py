@@ -21,7 +21,7 @@ than half.
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rig(tasks.Joined):
+class Rig(tasks.JointTask):
     """Combine the predictions about the images of several cameras in one configuration.
 
     Each image has its own truth, such as the box in it. The loss of the rig is the
@@ -60,7 +60,7 @@ class Rig(tasks.Joined):
         return (self.part,)
 
     @property
-    def of_one_image(self) -> Task:
+    def single_image_task(self) -> Task:
         task: Task = self.part
         return task
 
@@ -92,7 +92,7 @@ class Rig(tasks.Joined):
             minimise=minimise,
         )
 
-    def seeking(self, objective: str) -> Rig:
+    def with_objective(self, objective: str) -> Rig:
         return replace(self, part=self.part.seeking(objective))
 
     def check(self, facts: tasks.Facts) -> None:
@@ -160,7 +160,7 @@ class Rig(tasks.Joined):
                 self.part.predictions(image_output)[0][0]
                 for image_output in image_outputs
             ]
-            predictions_of_rigs.append((tasks.all_said(predictions),))
+            predictions_of_rigs.append((tasks.join_predictions(predictions),))
         return predictions_of_rigs
 
     def judge(
@@ -186,10 +186,10 @@ class Rig(tasks.Joined):
                 }
                 for judgement in judgements
             ]
-            prediction = tasks.all_said(
+            prediction = tasks.join_predictions(
                 judgement.prediction for judgement in judgements
             )
-            outcome = tasks.outcome_in(self._deciding(judgements, margin))
+            outcome = tasks.make_outcome_payload(self._deciding(judgements, margin))
             payload = {"pictures": image_payloads, **outcome}
             rig_judgements.append(
                 tasks.Judgement.of(score, margin, prediction, payload)

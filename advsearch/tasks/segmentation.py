@@ -19,14 +19,14 @@ EXPECTED = (
 )
 
 # Minimum fraction of right pixels at which the object is segmented in part.
-LEAST_ACCURACY = 0.1
+MIN_PARTIAL_ACCURACY = 0.1
 
 # Computes the lead (P,) of classes from logits (P, classes).
 Lead = Callable[[Tensor, tasks.Labels], Tensor]
 
 
 @dataclass(frozen=True)
-class Region:
+class SegmentationTruth:
     """What has to be segmented in an image: the truth of segmentation.
 
     Attributes:
@@ -37,7 +37,7 @@ class Region:
     labels: tasks.Labels
     mask: Tensor
 
-    def at(self, size: tuple[int, int]) -> Tensor:
+    def resize_mask(self, size: tuple[int, int]) -> Tensor:
         """Resize the mask to the size of an output, (h, w) bool.
 
         A pixel is the object's if at least half of it is; if there is no such pixel, all
@@ -95,35 +95,37 @@ class Segmentation(tasks.ClassTask):
             raise ValueError(EXPECTED)
         return returned.float()
 
-    def classes_in(self, output: Tensor) -> int:
+    def count_classes(self, output: Tensor) -> int:
         return output.shape[1]
 
-    def truth(self, facts: tasks.Facts) -> Region:
-        return Region(self.right_classes(facts), facts.mask)
+    def truth(self, facts: tasks.Facts) -> SegmentationTruth:
+        return SegmentationTruth(self.find_right_classes(facts), facts.mask)
 
-    def truth_names(self, truth: Region) -> tuple[str, ...]:
-        return self.names(truth.labels)
+    def truth_names(self, truth: SegmentationTruth) -> tuple[str, ...]:
+        return self.get_class_names(truth.labels)
 
-    def loss(self, output: Tensor, truth: Region) -> Tensor:
+    def loss(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
         """Compute the lead of wrong classes at the deciding pixel, in logits, (N,).
 
         It is over 0 if too few pixels are right. Of the object's pixels in the order of that
         lead, the deciding one is that at which `accuracy` of them is reached.
         """
-        return self._deciding(output, truth, tasks.wrong_lead, truth.labels)
+        return self._compute_deciding_lead(
+            output, truth, tasks.compute_wrong_lead, truth.labels
+        )
 
-    def score(self, output: Tensor, truth: Region) -> Tensor:
+    def score(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
         """See `Task.score`; with a target, enough of the object's pixels have to get it."""
         if self.target is None:
             return super().score(output, truth)
-        return -self._deciding(
+        return -self._compute_deciding_lead(
             output,
             truth,
-            lambda logits, labels: -tasks.target_lead(logits, labels),
+            lambda logits, labels: -tasks.compute_target_lead(logits, labels),
             self.target,
         )
 
-    def pixel_margin(self, output: Tensor, truth: Region) -> Tensor:
+    def pixel_margin(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
         """Compute the mean over the object's pixels of what is sought, in logits, (N,).
 
         That is the lead of wrong classes, or of the target's. Every pixel has a
@@ -131,33 +133,33 @@ class Segmentation(tasks.ClassTask):
         """
         pixels = self._object_logits(output, truth)
         if pixels is None:
-            return _not_visible(output)
+            return _make_hidden_value(output)
         if self.target is None:
-            lead = tasks.wrong_lead(pixels, truth.labels)
+            lead = tasks.compute_wrong_lead(pixels, truth.labels)
         else:
-            lead = tasks.target_lead(pixels, self.target)
+            lead = tasks.compute_target_lead(pixels, self.target)
         mean_lead = lead.reshape(len(output), -1).mean(dim=1)
         return -mean_lead if self.minimise else mean_lead
 
-    def _deciding(
-        self, output: Tensor, truth: Region, lead: Lead, labels: tasks.Labels
+    def _compute_deciding_lead(
+        self, output: Tensor, truth: SegmentationTruth, lead: Lead, labels: tasks.Labels
     ) -> Tensor:
         """Compute the lead at the pixel at which `accuracy` of them is reached, (N,)."""
         pixels = self._object_logits(output, truth)
         if pixels is None:
-            return _not_visible(output)
+            return _make_hidden_value(output)
         leads = lead(pixels, labels).reshape(len(output), -1)
         rank = math.ceil(self.accuracy * leads.shape[1])
         deciding_lead = leads.kthvalue(rank, dim=1).values
         return torch.where(leads.isfinite().all(dim=1), deciding_lead, math.nan)
 
     @staticmethod
-    def _object_logits(output: Tensor, truth: Region) -> Tensor | None:
+    def _object_logits(output: Tensor, truth: SegmentationTruth) -> Tensor | None:
         """Select the logits of the object's pixels, image by image, (N * P, classes).
 
         None if the object is out of view.
         """
-        mask = truth.at((output.shape[2], output.shape[3])).to(output.device)
+        mask = truth.resize_mask((output.shape[2], output.shape[3])).to(output.device)
         selected = output.permute(0, 2, 3, 1)[:, mask]
         return selected.reshape(-1, output.shape[1]) if selected.shape[1] else None
 
@@ -174,11 +176,11 @@ class Segmentation(tasks.ClassTask):
             n_classes = len(logits)
             n_pixels = logits[0].numel()
             counts = class_of_pixel.bincount(minlength=n_classes)
-            counts[list(self.nothing)] = 0
+            counts[list(self.nothing_classes)] = 0
             top_counts, top_classes = counts.topk(min(count, n_classes))
             predictions = tuple(
                 tasks.Prediction(
-                    self.name_of(class_id), class_id, class_count / n_pixels
+                    self.get_class_name(class_id), class_id, class_count / n_pixels
                 )
                 for class_id, class_count in zip(
                     top_classes.tolist(), top_counts.tolist(), strict=True
@@ -191,24 +193,24 @@ class Segmentation(tasks.ClassTask):
             predictions_of_images.append(predictions)
         return predictions_of_images
 
-    def said(
-        self, output: Tensor, truth: Region, margins: Sequence[float]
-    ) -> list[tasks.Said]:
+    def describe(
+        self, output: Tensor, truth: SegmentationTruth, margins: Sequence[float]
+    ) -> list[tasks.PredictionWithPayload]:
         """See `Task.said`: the class of most of the object's pixels.
 
         If too few are right, it is the most frequent wrong class; if that is background,
-        "no bottle", or "bottle in part" from `LEAST_ACCURACY` on. The probability is the
+        "no bottle", or "bottle in part" from `MIN_PARTIAL_ACCURACY` on. The probability is the
         fraction of the object's pixels that are right. The payload has the outcome, the
         fractions of the pixels by class, and the intersection over union.
         """
-        results: list[tasks.Said] = []
-        mask = truth.at((output.shape[2], output.shape[3])).to(output.device)
+        results: list[tasks.PredictionWithPayload] = []
+        mask = truth.resize_mask((output.shape[2], output.shape[3])).to(output.device)
         for logits, margin in zip(output, margins, strict=True):
             pixels = self._object_logits(logits[None], truth)
             if pixels is None:
                 results.append((tasks.Prediction(tasks.OUT_OF_VIEW), None))
                 continue
-            is_correct = self._correct(logits, truth)
+            is_correct = self._find_correct_pixels(logits, truth)
             accuracy = float(is_correct[mask].float().mean())
             iou = float((is_correct & mask).sum() / (is_correct | mask).sum())
             counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
@@ -216,7 +218,7 @@ class Segmentation(tasks.ClassTask):
                 counts, truth, accuracy, is_right=margin >= 0.0
             )
             fraction_by_class = {
-                self.name_of(class_id): round(class_count / len(pixels), 4)
+                self.get_class_name(class_id): round(class_count / len(pixels), 4)
                 for class_id, class_count in enumerate(counts.tolist())
                 if class_count
             }
@@ -230,7 +232,12 @@ class Segmentation(tasks.ClassTask):
         return results
 
     def _describe_object(
-        self, counts: Tensor, truth: Region, accuracy: float, *, is_right: bool
+        self,
+        counts: Tensor,
+        truth: SegmentationTruth,
+        accuracy: float,
+        *,
+        is_right: bool,
     ) -> tuple[tasks.Prediction, tasks.Outcome]:
         """Return the prediction about the object, and what becomes of it.
 
@@ -243,37 +250,42 @@ class Segmentation(tasks.ClassTask):
         is_right_class = torch.zeros_like(counts, dtype=torch.bool)
         is_right_class[list(truth.labels)] = True
         top_class = int(counts.masked_fill(is_right_class != is_right, -1).argmax())
-        if is_right or top_class not in self.nothing:
-            prediction = tasks.Prediction(self.name_of(top_class), top_class, accuracy)
+        if is_right or top_class not in self.nothing_classes:
+            prediction = tasks.Prediction(
+                self.get_class_name(top_class), top_class, accuracy
+            )
             outcome = tasks.Outcome.FOUND if is_right else tasks.Outcome.WRONG_CLASS
             return prediction, outcome
-        name = self.name_of(truth.labels[0])
-        if accuracy >= LEAST_ACCURACY:
+        name = self.get_class_name(truth.labels[0])
+        if accuracy >= MIN_PARTIAL_ACCURACY:
             prediction = tasks.Prediction(f"{name} in part", None, accuracy)
             return prediction, tasks.Outcome.LOOSE
-        prediction = tasks.Prediction(f"{tasks.NO}{name}", None, accuracy)
+        prediction = tasks.Prediction(f"{tasks.MISSED_PREFIX}{name}", None, accuracy)
         return prediction, tasks.Outcome.MISSED
 
     @staticmethod
-    def _correct(logits: Tensor, truth: Region) -> Tensor:
+    def _find_correct_pixels(logits: Tensor, truth: SegmentationTruth) -> Tensor:
         """Whether the largest of the logits (C, h, w) is that of a right class, (h, w)
         bool; a tie is right, NaN is not.
         """
         n_classes = logits.shape[0]
         pixels = logits.permute(1, 2, 0).reshape(-1, n_classes)
-        is_correct = tasks.wrong_lead(pixels, truth.labels) <= 0.0
+        is_correct = tasks.compute_wrong_lead(pixels, truth.labels) <= 0.0
         return is_correct.reshape(logits.shape[1:])
 
-    def marks(self, output: Tensor, truth: Region) -> list[list[tasks.Mark]]:
+    def marks(self, output: Tensor, truth: SegmentationTruth) -> list[list[tasks.Mark]]:
         """See `Task.marks`: the object, and the pixels that get a right class."""
-        name = " or ".join(self.names(truth.labels))
+        name = " or ".join(self.get_class_names(truth.labels))
         true_mark = tasks.Mark(name, True, mask=truth.mask)
         return [
-            [true_mark, tasks.Mark(name, False, mask=self._correct(logits, truth))]
+            [
+                true_mark,
+                tasks.Mark(name, False, mask=self._find_correct_pixels(logits, truth)),
+            ]
             for logits in output.detach()
         ]
 
 
-def _not_visible(output: Tensor) -> Tensor:
+def _make_hidden_value(output: Tensor) -> Tensor:
     """Return -1 for each of N outputs, attached to their graph, (N,)."""
     return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0

@@ -20,14 +20,14 @@ from torch.nn import functional
 
 from advsearch.extend import InputError, Model, models, stored_files, tasks
 
-MOST = 10_000  # maximum number of images in a gallery, before `scaled`
+MAX_REFERENCES = 10_000  # maximum number of images in a gallery, before `scaled`
 # Maximum size of a loaded image in pixels; larger ones are averaged down.
-SIDE = 1024
-AT_ONCE = 16  # batch size for a network
+MAX_IMAGE_SIZE = 1024
+BATCH_SIZE = 16  # batch size for a network
 # Weight of the squared weights of a linear head, next to a mean cross-entropy in nats.
-PENALTY = 1e-3
+WEIGHT_PENALTY = 1e-3
 # Maximum number of iterations of the fit; it usually converges after a few dozen.
-ROUNDS = 500
+MAX_ITERATIONS = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Gallery:
 
     Attributes:
         names: of the folders, in order.
-        owners: (R,) int64, the index of each image's name.
+        name_index: (R,) int64, the index of each image's name.
         paths: of each image, relative to the folder.
         features: (R, D), of length 1.
         embedder: the network that embedded them, and its preprocessing.
@@ -44,18 +44,18 @@ class Gallery:
     """
 
     names: tuple[str, ...]
-    owners: Tensor
+    name_index: Tensor
     paths: tuple[str, ...]
     features: Tensor
     embedder: tuple[Any, ...] = field(repr=False)
     head: tuple[Tensor, Tensor] | None = field(default=None, repr=False)
 
-    def cosines(self, features: Tensor) -> Tensor:
+    def compute_cosines(self, features: Tensor) -> Tensor:
         """Compute the cosines (N, R) between features (N, D) of length 1 and each image."""
         return features @ self.features.to(features).T
 
 
-def folders_of(folder: str) -> list[tuple[str, Path]]:
+def list_name_folders(folder: str) -> list[tuple[str, Path]]:
     """List the names in a folder with their folders, in alphabetical order.
 
     Hidden folders are left out.
@@ -75,7 +75,7 @@ def folders_of(folder: str) -> list[tuple[str, Path]]:
     return folders
 
 
-def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
+def embed_gallery(folder: str, model: Model, *, linear: bool) -> Gallery:
     """Embed the reference images in a folder, which has one folder per name.
 
     An image is turned upright, cropped at its center to the shape of the model's input,
@@ -87,11 +87,11 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
         linear: fit a linear head on the features.
 
     Raises:
-        InputError: as for `folders_of`; a name without an image; too many images;
+        InputError: as for `list_name_folders`; a name without an image; too many images;
             features that are not (N, D).
         FileFormatError: a file that is no image, or a huge one.
     """
-    named_folders = folders_of(folder)
+    named_folders = list_name_folders(folder)
     root = Path(folder).expanduser()
     paths: list[Path] = []
     name_indices: list[int] = []
@@ -104,7 +104,7 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
             )
         paths += image_paths
         name_indices += [index] * len(image_paths)
-    limit = stored_files.scaled(MOST)
+    limit = stored_files.scaled(MAX_REFERENCES)
     if len(paths) > limit:
         raise stored_files.too_large(
             root, f"at most {limit:,} reference pictures", f"{len(paths):,}"
@@ -113,25 +113,27 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
     owners = torch.tensor(name_indices)
     return Gallery(
         names=tuple(name for name, _ in named_folders),
-        owners=owners,
+        name_index=owners,
         paths=tuple(path.relative_to(root).as_posix() for path in paths),
         features=features,
         embedder=(model.module, model.preprocessing),
-        head=fitted(features, owners) if linear else None,
+        head=fit_linear_head(features, owners) if linear else None,
     )
 
 
 def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
     """Compute the features (R, D) of length 1 of the images in files, in batches."""
     images = (
-        _crop_center(torch.from_numpy(models.upright(path, SIDE)), model.input_size)
+        _crop_center(
+            torch.from_numpy(models.upright(path, MAX_IMAGE_SIZE)), model.input_size
+        )
         for path in paths
     )
     batches: list[Tensor] = []
     with torch.no_grad():
         # A batch has images of one size; groupby keeps the order of the files.
         for _, same_size in itertools.groupby(images, key=lambda image: image.shape):
-            while batch := list(itertools.islice(same_size, AT_ONCE)):
+            while batch := list(itertools.islice(same_size, BATCH_SIZE)):
                 batches.append(model(torch.stack(batch)))
                 if batches[-1].dim() != 2:
                     raise InputError(
@@ -148,7 +150,7 @@ def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
     return functional.normalize(features, dim=1)
 
 
-def fitted(features: Tensor, owners: Tensor) -> tuple[Tensor, Tensor]:
+def fit_linear_head(features: Tensor, name_index: Tensor) -> tuple[Tensor, Tensor]:
     """Fit a multinomial logistic regression of names on features.
 
     Names have equal weights, however many images they have. The loss is convex, so its
@@ -157,14 +159,14 @@ def fitted(features: Tensor, owners: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         features: (R, D).
-        owners: (R,) int64, the index of each row's name.
+        name_index: (R,) int64, the index of each row's name.
 
     Returns:
         Weights (names, D) and biases (names,), float32.
     """
-    n_names = int(owners.max()) + 1
-    images_per_name = torch.bincount(owners, minlength=n_names).double()
-    image_weights = 1.0 / (n_names * images_per_name[owners])
+    n_names = int(name_index.max()) + 1
+    images_per_name = torch.bincount(name_index, minlength=n_names).double()
+    image_weights = 1.0 / (n_names * images_per_name[name_index])
     center = features.double().mean(dim=0)
     centered = features.double() - center
     weights = torch.zeros(
@@ -173,7 +175,7 @@ def fitted(features: Tensor, owners: Tensor) -> tuple[Tensor, Tensor]:
     biases = torch.zeros(n_names, dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.LBFGS(
         [weights, biases],
-        max_iter=ROUNDS,
+        max_iter=MAX_ITERATIONS,
         tolerance_grad=1e-8,
         tolerance_change=1e-12,
         line_search_fn="strong_wolfe",
@@ -182,8 +184,8 @@ def fitted(features: Tensor, owners: Tensor) -> tuple[Tensor, Tensor]:
     def closure() -> Tensor:
         optimizer.zero_grad()
         logits = functional.linear(centered, weights, biases)
-        image_loss = functional.cross_entropy(logits, owners, reduction="none")
-        penalty = PENALTY / 2.0 * weights.square().sum()
+        image_loss = functional.cross_entropy(logits, name_index, reduction="none")
+        penalty = WEIGHT_PENALTY / 2.0 * weights.square().sum()
         loss: Tensor = (image_weights * image_loss).sum() + penalty
         torch.autograd.backward(loss, inputs=[weights, biases])
         return loss
@@ -228,7 +230,7 @@ Caron et al. 2021, arXiv 2104.14294, section 4.1).
 """
 
 ITSELF = "itself"
-ELSE = "something else"
+SOMETHING_ELSE = "something else"
 """The predictions with a threshold."""
 
 
@@ -245,7 +247,7 @@ class Similarity(tasks.Classification):
       prediction is right exactly if the nearest image of all is; a larger k lets no single
       image decide.
     - `linear`: those of a logistic regression on the reference features, of length 1
-      (`fitted`).
+      (`fit_linear_head`).
 
     With `threshold` the logits are the cosine to the clean image's features and the
     threshold, over `TEMPERATURE`.
@@ -263,7 +265,7 @@ class Similarity(tasks.Classification):
 
     name = "similarity"
     reads_logits = False
-    names_from = "its folders"
+    names_source = "its folders"
 
     references: str = ""
     method: str = METHODS[0]
@@ -310,8 +312,8 @@ class Similarity(tasks.Classification):
         """See `Task.on`; references are loaded and embedded, unless they are already.
 
         Raises:
-            InputError: there are neither references nor a threshold; or as for `embedded`.
-            FileFormatError: as for `embedded`.
+            InputError: there are neither references nor a threshold; or as for `embed_gallery`.
+            FileFormatError: as for `embed_gallery`.
         """
         if not self.references and self.threshold is None:
             raise InputError(
@@ -331,18 +333,18 @@ class Similarity(tasks.Classification):
         is_embedded = self.gallery is not None and self.gallery.embedder == embedder
         if is_embedded or not self.references:
             return task
-        gallery = embedded(self.references, model, linear=self.method == "linear")
+        gallery = embed_gallery(self.references, model, linear=self.method == "linear")
         return replace(task, gallery=gallery)
 
-    def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
+    def _get_model_labels(self, model: Model) -> tuple[tuple[str, ...], bool]:
         if not self.references:
-            return (ITSELF, ELSE), True
-        return tuple(name for name, _ in folders_of(self.references)), True
+            return (ITSELF, SOMETHING_ELSE), True
+        return tuple(name for name, _ in list_name_folders(self.references)), True
 
-    def right_classes(self, facts: tasks.Facts) -> tasks.Labels:
+    def find_right_classes(self, facts: tasks.Facts) -> tasks.Labels:
         """See `ClassTask.right_classes`; with a threshold the clean image defines what is right."""
         if self.references:
-            return super().right_classes(facts)
+            return super().find_right_classes(facts)
         if facts.label is not None:
             raise InputError(
                 "label: a `threshold` knows no names, the clean picture "
@@ -381,7 +383,7 @@ class Similarity(tasks.Classification):
             )
         return features.float()
 
-    def logits(self, output: Tensor) -> Tensor:
+    def compute_logits(self, output: Tensor) -> Tensor:
         """Compute logits (N, names) of features (N, D); differentiable."""
         features = functional.normalize(output, dim=1)
         if self.gallery is None:
@@ -399,8 +401,8 @@ class Similarity(tasks.Classification):
             return functional.linear(
                 features, weights.to(features), biases.to(features)
             )
-        cosines = self.gallery.cosines(features)
-        owners = self.gallery.owners.to(features.device)
+        cosines = self.gallery.compute_cosines(features)
+        owners = self.gallery.name_index.to(features.device)
         name_scores = []
         for name_index in range(len(self.gallery.names)):
             name_cosines = cosines[:, owners == name_index]
@@ -409,7 +411,7 @@ class Similarity(tasks.Classification):
         return torch.stack(name_scores, dim=1) / TEMPERATURE
 
     def as_logits(self, output: Tensor, truth: tasks.Labels) -> Tensor:
-        return super().as_logits(self.logits(output), truth)
+        return super().as_logits(self.compute_logits(output), truth)
 
     def judge(self, output: Tensor, truth: tasks.Labels) -> list[tasks.Judgement]:
         """See `Task.judge`; the payload has the cosine to the clean image, or the ranks of
@@ -452,8 +454,8 @@ def _rank_references(
         and the `nearest` reference and its cosine.
     """
     right_names = torch.tensor(truth)
-    cosines = gallery.cosines(features)
-    is_right_image = torch.isin(gallery.owners, right_names).to(cosines.device)
+    cosines = gallery.compute_cosines(features)
+    is_right_image = torch.isin(gallery.name_index, right_names).to(cosines.device)
     right_cosine = cosines[:, is_right_image].amax(dim=1)
     is_nearer = cosines[:, ~is_right_image] > right_cosine[:, None]
     image_rank = 1 + is_nearer.sum(dim=1)

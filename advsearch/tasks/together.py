@@ -15,15 +15,21 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model, Preprocessing
-from advsearch.models.model import joined
-from advsearch.options import FROM_RUN, JOINED, OUT_OF_VIEW, OUTCOME, get_outcome
+from advsearch.models.model import join_outputs
+from advsearch.options import (
+    FROM_RUN,
+    OUT_OF_VIEW,
+    OUTCOME,
+    TASK_SEPARATOR,
+    get_outcome,
+)
 from advsearch.tasks.base import (
     Facts,
     Judgement,
     Mark,
     Output,
     Prediction,
-    Said,
+    PredictionWithPayload,
     Task,
     Truth,
     mean,
@@ -36,7 +42,7 @@ Outputs = tuple[Any, ...]
 
 @final
 class Ensemble:
-    """Run several models, each with its own preprocessing: the `Model.module` of `together`."""
+    """Run several models, each with its own preprocessing: the `Model.module` of `join_models`."""
 
     def __init__(self, models: Sequence[Model]) -> None:
         self.models = tuple(models)
@@ -46,7 +52,7 @@ class Ensemble:
         return [model(images) for model in self.models]
 
 
-def together(models: Sequence[Model], size: tuple[int, int] | None = None) -> Model:
+def join_models(models: Sequence[Model], size: tuple[int, int] | None = None) -> Model:
     """Combine several models into one.
 
     Args:
@@ -66,11 +72,11 @@ def together(models: Sequence[Model], size: tuple[int, int] | None = None) -> Mo
         labels=(),
         preprocessing=Preprocessing(size or (max_height, max_width), layout="NHWC"),
         differentiable=all(model.differentiable for model in models),
-        read=by_picture,
+        read=split_by_image,
     )
 
 
-def by_picture(returned: list[Any], count: int) -> list[Outputs]:
+def split_by_image(returned: list[Any], count: int) -> list[Outputs]:
     """Regroup the outputs of `count` images from model by model to image by image."""
     return [
         tuple(output[index : index + 1] for output in returned)
@@ -78,16 +84,16 @@ def by_picture(returned: list[Any], count: int) -> list[Outputs]:
     ]
 
 
-def of_each(outputs: Sequence[Outputs]) -> list[Any]:
+def split_by_model(outputs: Sequence[Outputs]) -> list[Any]:
     """Regroup the outputs of N images from image by image to model by model."""
-    return [joined(model_outputs) for model_outputs in zip(*outputs, strict=True)]
+    return [join_outputs(model_outputs) for model_outputs in zip(*outputs, strict=True)]
 
 
 Truths = tuple[Truth, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Joined(Task):
+class JointTask(Task):
     """A task made of others, the `judges`: one for each of its truths in order, or one for
     all.
     """
@@ -129,19 +135,19 @@ def _distinct(groups: Iterable[Iterable[str]]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(chain.from_iterable(groups)))
 
 
-def outcome_in(judgement: Judgement) -> dict[str, JsonValue]:
+def make_outcome_payload(judgement: Judgement) -> dict[str, JsonValue]:
     """Return the outcome of a judgement as a part of a payload; empty if it states none."""
     outcome = get_outcome(judgement.payload)
     return {} if outcome is None else {OUTCOME: outcome.value}
 
 
-def all_said(predictions: Iterable[Prediction]) -> Prediction:
+def join_predictions(predictions: Iterable[Prediction]) -> Prediction:
     """Join the labels of several predictions into one prediction."""
     return Prediction("; ".join(prediction.label for prediction in predictions))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Together(Joined):
+class EnsembleTask(JointTask):
     """Judge several models, each by its own task and labels.
 
     A prediction is right if all models are right, and a success if it is one for every
@@ -152,7 +158,7 @@ class Together(Joined):
     name = "ensemble"
     objective = "each"
 
-    # One for each model, in the order of the outputs of `together`.
+    # One for each model, in the order of the outputs of `join_models`.
     parts: tuple[Task, ...]
     models: tuple[Model, ...] = field(default=(), metadata=FROM_RUN)
     # The `parts` on these models.
@@ -165,18 +171,18 @@ class Together(Joined):
     @property
     def title(self) -> str:
         names = [part.title for part in self.parts]
-        return JOINED.join(names) if len(set(names)) > 1 else self.name
+        return TASK_SEPARATOR.join(names) if len(set(names)) > 1 else self.name
 
     def read(self, returned: Any, count: int) -> list[Outputs]:
-        return by_picture(returned, count)
+        return split_by_image(returned, count)
 
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
-    ) -> Together:
+    ) -> EnsembleTask:
         """See `Task.on`; if only some tasks take a label, the target is theirs.
 
         Raises:
-            InputError: the model is not from `together`, or has not one model per task.
+            InputError: the model is not from `join_models`, or has not one model per task.
         """
         models = model.module.models if isinstance(model.module, Ensemble) else ()
         if len(models) != len(self.parts):
@@ -197,12 +203,12 @@ class Together(Joined):
             self, models=models, tasks=tasks, target=targets, minimise=minimise
         )
 
-    def seeking(self, objective: str) -> Together:
+    def with_objective(self, objective: str) -> EnsembleTask:
         return replace(
-            self, parts=tuple(part.seeking(objective) for part in self.parts)
+            self, parts=tuple(part.with_objective(objective) for part in self.parts)
         )
 
-    def told(self, task: Task, facts: Facts) -> Facts:
+    def select_facts(self, task: Task, facts: Facts) -> Facts:
         """Return the facts for one of the tasks: without a label that is for others."""
         return facts if self._takes_label(task) else replace(facts, label=None)
 
@@ -212,17 +218,17 @@ class Together(Joined):
 
     def check(self, facts: Facts) -> None:
         for task in self.tasks:
-            task.check(self.told(task, facts))
+            task.check(self.select_facts(task, facts))
 
     def after_calibration(
         self, output: Sequence[Outputs], truth: Truths | None
-    ) -> Together:
+    ) -> EnsembleTask:
         """See `Task.after_calibration`: each task gets the output of its model."""
         truths = truth or [None] * len(self.tasks)
         tasks = tuple(
             task.after_calibration(model_output, task_truth)
             for task, model_output, task_truth in zip(
-                self.tasks, of_each(output), truths, strict=True
+                self.tasks, split_by_model(output), truths, strict=True
             )
         )
         return replace(self, tasks=tasks)
@@ -260,10 +266,12 @@ class Together(Joined):
         """Return the joint prediction of the models about each image."""
         predictions_of_models = [
             task.predictions(model_output)
-            for task, model_output in zip(self.tasks, of_each(output), strict=True)
+            for task, model_output in zip(
+                self.tasks, split_by_model(output), strict=True
+            )
         ]
         return [
-            (all_said(predictions[0] for predictions in image_predictions),)
+            (join_predictions(predictions[0] for predictions in image_predictions),)
             for image_predictions in zip(*predictions_of_models, strict=True)
         ]
 
@@ -282,7 +290,7 @@ class Together(Joined):
         """Join the models' judgements of one image."""
         worst = min(judgements, key=lambda judgement: judgement.margin)
         margin = worst.margin
-        if any(judgement.not_a_number for judgement in judgements):
+        if any(judgement.is_not_a_number for judgement in judgements):
             margin = math.nan
         payload = None
         if any(judgement.payload is not None for judgement in judgements):
@@ -290,8 +298,8 @@ class Together(Joined):
                 model.name: judgement.payload
                 for model, judgement in zip(self.models, judgements, strict=True)
             }
-            payload |= outcome_in(worst)
-        prediction = all_said(judgement.prediction for judgement in judgements)
+            payload |= make_outcome_payload(worst)
+        prediction = join_predictions(judgement.prediction for judgement in judgements)
         score = min(judgement.score for judgement in judgements)
         return Judgement.of(score, margin, prediction, payload)
 
@@ -323,7 +331,7 @@ class Together(Joined):
         self, output: Sequence[Outputs], truth: Truths
     ) -> list[tuple[Any, Any, Any]]:
         """Return each task with the output of its model and its truth."""
-        return list(zip(self.tasks, of_each(output), truth, strict=True))
+        return list(zip(self.tasks, split_by_model(output), truth, strict=True))
 
 
 # ---- one task for the object and every other thing ----
@@ -331,12 +339,12 @@ class Together(Joined):
 # A prediction is right if it is right about all of them. A search seeks a wrong
 # prediction about any of them: loss and score are the largest over the things.
 
-TruthOfEach = Mapping[str, Truth]  # the truth of each thing, by name
+TruthByThing = Mapping[str, Truth]  # the truth of each thing, by name
 
 
 @dataclass(frozen=True, kw_only=True)
-class EachThing(Joined):
-    """Judge every thing in an image by one task; created by `each_thing`."""
+class EachThingTask(JointTask):
+    """Judge every thing in an image by one task; created by `make_each_thing_task`."""
 
     name = "each thing"
 
@@ -346,7 +354,9 @@ class EachThing(Joined):
     def judges(self) -> tuple[Task, ...]:
         return (self.part,)
 
-    def after_calibration(self, output: Output, truth: TruthOfEach | None) -> EachThing:
+    def after_calibration(
+        self, output: Output, truth: TruthByThing | None
+    ) -> EachThingTask:
         """See `Task.after_calibration`: with the truth of the first thing."""
         first_truth = None if truth is None else next(iter(truth.values()))
         return replace(self, part=self.part.after_calibration(output, first_truth))
@@ -355,25 +365,25 @@ class EachThing(Joined):
         for thing in facts.each.values():
             self.part.check(thing)
 
-    def truth(self, facts: Facts) -> TruthOfEach:
+    def truth(self, facts: Facts) -> TruthByThing:
         return {name: self.part.truth(thing) for name, thing in facts.each.items()}
 
-    def loss(self, output: Output, truth: TruthOfEach) -> Tensor:
+    def loss(self, output: Output, truth: TruthByThing) -> Tensor:
         """Compute the largest loss over the things, (N,)."""
         return self._max_over_things("loss", output, truth)
 
-    def score(self, output: Output, truth: TruthOfEach) -> Tensor:
+    def score(self, output: Output, truth: TruthByThing) -> Tensor:
         """Compute the largest score over the things, (N,)."""
         if self.minimise:
             return -self.loss(output, truth)
         return self._max_over_things("score", output, truth)
 
-    def pixel_margin(self, output: Output, truth: TruthOfEach) -> Tensor:
+    def pixel_margin(self, output: Output, truth: TruthByThing) -> Tensor:
         """Compute the largest pixel margin over the things, (N,); for segmentation."""
         return self._max_over_things("pixel_margin", output, truth)
 
     def _max_over_things(
-        self, method: str, output: Output, truth: TruthOfEach
+        self, method: str, output: Output, truth: TruthByThing
     ) -> Tensor:
         """Compute the largest value of a method of the task over the things, (N,)."""
         function = getattr(self.part, method)
@@ -385,9 +395,9 @@ class EachThing(Joined):
     ) -> list[tuple[Prediction, ...]]:
         return self.part.predictions(output, count)
 
-    def said(
-        self, output: Output, truth: TruthOfEach, margins: Sequence[float]
-    ) -> list[Said]:
+    def describe(
+        self, output: Output, truth: TruthByThing, margins: Sequence[float]
+    ) -> list[PredictionWithPayload]:
         """See `Task.said`: the prediction about the worst visible thing.
 
         The payload is that of the worst thing, with the judgement of each.
@@ -395,7 +405,7 @@ class EachThing(Joined):
         judgements_of_things = [
             self.part.judge(output, thing_truth) for thing_truth in truth.values()
         ]
-        results: list[Said] = []
+        results: list[PredictionWithPayload] = []
         for image_judgements in zip(*judgements_of_things, strict=True):
             by_name: dict[str, Judgement] = dict(
                 zip(truth, image_judgements, strict=True)
@@ -421,7 +431,7 @@ class EachThing(Joined):
             results.append((by_name[worst].prediction, payload))
         return results
 
-    def marks(self, output: Output, truth: TruthOfEach) -> list[list[Mark]]:
+    def marks(self, output: Output, truth: TruthByThing) -> list[list[Mark]]:
         """See `Task.marks`: the truth of each thing, and the prediction once."""
         marks_of_things = [
             self.part.marks(output, thing_truth) for thing_truth in truth.values()
@@ -440,32 +450,32 @@ def _summarize_thing(judgement: Judgement) -> dict[str, JsonValue]:
         "right": judgement.right,
         "margin": judgement.margin,
         "answer": judgement.prediction.label,
-        **outcome_in(judgement),
+        **make_outcome_payload(judgement),
     }
     if isinstance(judgement.payload, dict) and "box" in judgement.payload:
         summary["box"] = judgement.payload["box"]
     return summary
 
 
-def each_thing(task: Task) -> EachThing:
+def make_each_thing_task(task: Task) -> EachThingTask:
     """Return a task on its model as one that judges every thing.
 
     Raises:
         InputError: its models make one prediction about the full image, or there are
             several models.
     """
-    if isinstance(task, Together) or task.name not in JUDGES:
+    if isinstance(task, EnsembleTask) or task.name not in PER_THING_TASKS:
         raise InputError(
-            f"judge: all is for {' and '.join(JUDGES)}, got task {task.name}; judge "
+            f"judge: all is for {' and '.join(PER_THING_TASKS)}, got task {task.name}; judge "
             "one thing, by its name"
         )
     attributes = {"name": task.name, "objective": task.objective}
-    task_class: Any = type("EachThing", (EachThing,), attributes)
-    result: EachThing = task_class(
+    task_class: Any = type("EachThing", (EachThingTask,), attributes)
+    result: EachThingTask = task_class(
         part=task, minimise=task.minimise, target=task.target
     )
     return result
 
 
-JUDGES: Sequence[str] = ("detection", "segmentation", "depth")
+PER_THING_TASKS: Sequence[str] = ("detection", "segmentation", "depth")
 """Tasks whose output for an image covers each thing in it."""

@@ -1,7 +1,7 @@
 """Connections of the dashboard's server: worker threads, time limits, and HTTPS.
 
 A few workers serve the requests. A client that has sent nothing yet occupies none of
-them; a slow client occupies one until its time is up, or for `GRACE` while others wait.
+them; a slow client occupies one until its time is up, or for `SLOW_CLIENT_SECONDS` while others wait.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from queue import Empty, LifoQueue
 from typing import Any
 
 # requests that are served at once; others wait
-WORKERS = 16
-WAITING = 128
+N_WORKERS = 16
+MAX_WAITING = 128
 """Connections that may be open and wait for a worker or for their client.
 
 More wait in the operating system, without an open file in this process.
 """
 # seconds that a client has to send its request
-PATIENCE = 10.0
-# minimum bytes per second at which a client takes the response, after `PATIENCE`
-SLOWEST = 50_000
+REQUEST_SECONDS = 10.0
+# minimum bytes per second at which a client takes the response, after `REQUEST_SECONDS`
+MIN_BYTES_PER_SECOND = 50_000
 # seconds that a slow client has while others wait
-GRACE = 1.0
+SLOW_CLIENT_SECONDS = 1.0
 # seconds between two checks of the time limits
-TICK = 0.05
+CHECK_INTERVAL = 0.05
 # maximum bytes of a request's body
-LARGEST_SENT = 16 << 20
+MAX_BODY_BYTES = 16 << 20
 # what to type if QR codes cannot be drawn
 NO_QR = "pip install segno"
 
 
-def reachable(host: str) -> str:
+def find_reachable_address(host: str) -> str:
     """Return the address under which other machines reach what listens at `host`.
 
     If it listens at all addresses, that is the address of the default route.
@@ -76,24 +76,24 @@ class _Connection:
     due: float = math.inf
 
 
-class Clients:
+class ConnectionPool:
     """Serve the connections that a socket accepts until `close`.
 
     Args:
         listening: the socket that listens.
-        answer: serves a connection in a worker's thread; calls `wait_for` when it begins
+        answer: serves a connection in a worker's thread; calls `report_waiting` when it begins
             or ends to wait for the client.
         context: for HTTPS; without it, HTTP.
     """
 
     def __init__(
         self,
-        listening: socket.socket,
-        answer: Callable[[socket.socket, Any], None],
+        listening_socket: socket.socket,
+        handle: Callable[[socket.socket, Any], None],
         context: ssl.SSLContext | None,
     ) -> None:
-        self._listening = listening
-        self._handle = answer
+        self._listening = listening_socket
+        self._handle = handle
         self._context = context
         # The newest connection is served first: many old ones may be an attack.
         self._ready: LifoQueue[tuple[socket.socket, Any] | None] = LifoQueue()
@@ -108,9 +108,9 @@ class Clients:
 
         def work() -> None:
             while (job := self._ready.get()) is not None:
-                self.serve_one(*job)
+                self.serve_connection(*job)
 
-        for _ in range(WORKERS):
+        for _ in range(N_WORKERS):
             threading.Thread(target=work, daemon=True).start()
         try:
             with selectors.DefaultSelector() as selector:
@@ -126,10 +126,10 @@ class Clients:
             # behind `None` no worker comes to them
             while (job := self._ready.get_nowait()) is not None:
                 job[0].close()
-        for _ in range(WORKERS):
+        for _ in range(N_WORKERS):
             self._ready.put(None)
 
-    def wait_for(self, seconds: float | None) -> None:
+    def report_waiting(self, seconds: float | None) -> None:
         """Report, in a worker's thread, that it waits for its client from now on.
 
         It waits for `seconds` at most; None reports that it no longer waits.
@@ -149,13 +149,13 @@ class Clients:
         silent: dict[Any, tuple[Any, float]] = {}
         listens = False
         while not self._closed.is_set():
-            has_room = len(silent) + self._ready.qsize() < WAITING
+            has_room = len(silent) + self._ready.qsize() < MAX_WAITING
             if has_room and not listens:
                 selector.register(self._listening, selectors.EVENT_READ)
             elif listens and not has_room:
                 selector.unregister(self._listening)
             listens = has_room
-            for key, _ in selector.select(TICK):
+            for key, _ in selector.select(CHECK_INTERVAL):
                 connection: Any = key.fileobj
                 if connection is self._listening:
                     with suppress(OSError):
@@ -166,7 +166,11 @@ class Clients:
                     selector.unregister(connection)
                     self._ready.put((connection, silent.pop(connection)[0]))
             now = time.monotonic()
-            patience = PATIENCE if has_room else min(PATIENCE, GRACE)
+            patience = (
+                REQUEST_SECONDS
+                if has_room
+                else min(REQUEST_SECONDS, SLOW_CLIENT_SECONDS)
+            )
             for connection, (_, since) in list(silent.items()):
                 if now - since > patience:
                     del silent[connection]
@@ -179,14 +183,14 @@ class Clients:
     def _end_slow_clients(self, now: float) -> None:
         """End clients whose time is up.
 
-        While others wait, those that have had `GRACE` end too, the slowest first.
+        While others wait, those that have had `SLOW_CLIENT_SECONDS` end too, the slowest first.
         """
         clients = sorted(
             self._connections.copy().values(), key=lambda client: client.since
         )
-        n_waiting = self._ready.qsize() if len(clients) == WORKERS else 0
+        n_waiting = self._ready.qsize() if len(clients) == N_WORKERS else 0
         for client in clients:
-            makes_room = n_waiting > 0 and now - client.since > GRACE
+            makes_room = n_waiting > 0 and now - client.since > SLOW_CLIENT_SECONDS
             if client.due < now or makes_room:
                 n_waiting -= 1
                 client.since = math.inf
@@ -195,7 +199,7 @@ class Clients:
                 with suppress(OSError):
                     socket.socket.shutdown(client.connection, socket.SHUT_RDWR)
 
-    def serve_one(self, connection: socket.socket, address: Any) -> None:
+    def serve_connection(self, connection: socket.socket, address: Any) -> None:
         """Serve one client in this thread; whatever it does, nothing is raised."""
         thread = threading.get_ident()
         try:
@@ -205,7 +209,7 @@ class Clients:
                     connection, server_side=True, do_handshake_on_connect=False
                 )
             self._connections[thread] = _Connection(connection)
-            self.wait_for(PATIENCE)
+            self.report_waiting(REQUEST_SECONDS)
             if isinstance(connection, ssl.SSLSocket):
                 connection.do_handshake()
             self._handle(connection, address)
@@ -218,16 +222,16 @@ class Clients:
             connection.close()
 
 
-def qr_text(address: str) -> str | None:
+def format_qr_code(address: str) -> str | None:
     """Return an address as a QR code for a terminal, None if segno is not installed."""
-    code = qr_code(address)
+    code = make_qr_code(address)
     text = io.StringIO()
     if code is not None:
         code.terminal(out=text, compact=True)
     return text.getvalue() or None
 
 
-def qr_code(address: str) -> Any:
+def make_qr_code(address: str) -> Any:
     """Return the QR code of an address, None if segno is not installed."""
     try:
         return importlib.import_module("segno").make(address, error="m", micro=False)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 # distinct names of an axis, or predictions; further ones are merged to "others"
-MOST_LEVELS = 65535
+MAX_LEVELS = 65535
 # `right` of a row whose prediction was not evaluated
 UNKNOWN = 2
 NO_PROBABILITY = 65535
@@ -33,9 +33,9 @@ NO_PROBABILITY = 65535
 BOX_STEPS = 8
 NO_BOX = 65535
 # the key in a frame's `attrs` of the boxes of its rows
-OTHERS = "boxes"
+BOXES_ATTRIBUTE = "boxes"
 # values of a box in `Boxes`: its corners, the index of its name, its score
-OF_A_BOX = 6
+VALUES_PER_BOX = 6
 
 
 @dataclass
@@ -43,17 +43,17 @@ class Boxes:
     """All boxes of a detector's predictions, and the true ones, of rows with any number.
 
     Attributes:
-        numbers: `OF_A_BOX` uint16 values a box: x0, y0, x1 and y1 in `BOX_STEPS` of a
+        values: `VALUES_PER_BOX` uint16 values a box: x0, y0, x1 and y1 in `BOX_STEPS` of a
             pixel, index of the name, score in 1/10000 (`NO_PROBABILITY` of true boxes).
         ends: number of boxes up to and including each row.
         names: index of each name of a class or a thing.
     """
 
-    numbers: array[int] = field(default_factory=lambda: array("H"))
+    values: array[int] = field(default_factory=lambda: array("H"))
     ends: array[int] = field(default_factory=lambda: array("L"))
     names: dict[str, int] = field(default_factory=dict)
 
-    def put(self, payload: Mapping[str, Any]) -> None:
+    def add(self, payload: Mapping[str, Any]) -> None:
         """Add the true boxes and the detections of a row's payload."""
         for name, thing in payload.get("things", {}).items():
             if thing.get("box"):
@@ -67,9 +67,9 @@ class Boxes:
         x0, y0, x1, y1 = (
             min(max(round(BOX_STEPS * float(corner)), 0), NO_BOX - 1) for corner in box
         )
-        next_index = min(len(self.names), MOST_LEVELS)
+        next_index = min(len(self.names), MAX_LEVELS)
         name_index = self.names.setdefault(str(name), next_index)
-        self.numbers.extend((x0, y0, x1, y1, name_index, score))
+        self.values.extend((x0, y0, x1, y1, name_index, score))
 
     def __deepcopy__(self, memo: object) -> Boxes:
         """Return itself: pandas copies the attributes of a frame with every column it selects."""
@@ -84,13 +84,15 @@ CORNERS = tuple(
 """Columns of detection: corners of the true and of the predicted box, pixels."""
 
 
-def read_columns(run: Path, after: int = 0, most: int | None = None) -> pd.DataFrame:
+def read_columns(
+    run: Path, after: int = 0, max_rows: int | None = None
+) -> pd.DataFrame:
     """Read rows of a sweep as a frame (`runs.tables`), with `CORNERS` if it has boxes.
 
     Args:
         run: directory of the run.
         after: id of the row after which to begin.
-        most: maximum number of rows.
+        max_rows: maximum number of rows.
 
     Raises:
         FileFormatError: if the results cannot be read.
@@ -108,8 +110,8 @@ def read_columns(run: Path, after: int = 0, most: int | None = None) -> pd.DataF
                 f"something else; {DAMAGED}"
             ) from None
 
-    rows = read_sweep(run, after, most, read_corners)
-    rows.attrs[OTHERS] = boxes
+    rows = read_sweep(run, after, max_rows, read_corners)
+    rows.attrs[BOXES_ATTRIBUTE] = boxes
     return rows
 
 
@@ -128,17 +130,19 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
             if detection["label"] == label:
                 best_box = detection["box"]
                 break
-        boxes.put(payload)
+        boxes.add(payload)
         values = list[float]()
         for box in (payload["box"], best_box):
             for corner in box or [None] * 4:
                 values.append(math.nan if corner is None else float(corner))
         corners = dict(zip(CORNERS, values, strict=True))
-    boxes.ends.append(len(boxes.numbers) // OF_A_BOX)
+    boxes.ends.append(len(boxes.values) // VALUES_PER_BOX)
     return corners
 
 
-def packed(rows: pd.DataFrame, *, more: bool = False, running: bool = False) -> bytes:
+def pack_columns(
+    rows: pd.DataFrame, *, has_more: bool = False, is_running: bool = False
+) -> bytes:
     """Serialize rows for a browser: length of the head, the head, the columns.
 
     The length is a uint32; the head is JSON, padded to a multiple of 4 bytes. It has
@@ -149,8 +153,8 @@ def packed(rows: pd.DataFrame, *, more: bool = False, running: bool = False) -> 
 
     Args:
         rows: a frame as `read_columns` returns it.
-        more: whether the run has further rows already.
-        running: whether the run is adding rows.
+        has_more: whether the run has further rows already.
+        is_running: whether the run is adding rows.
     """
     columns, labels, outcome_names = _prediction_columns(rows)
     parameter_columns, parameters = _parameter_columns(rows)
@@ -171,12 +175,12 @@ def packed(rows: pd.DataFrame, *, more: bool = False, running: bool = False) -> 
             entry["length"] = values.size
         layout.append(entry)
         offset += values.nbytes
-    boxes: Boxes | None = rows.attrs.get(OTHERS)
+    boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
     head = {
         "count": len(rows),
         "last": int(rows["id"].iloc[-1]) if len(rows) else 0,
-        "more": more,
-        "running": running,
+        "more": has_more,
+        "running": is_running,
         "answers": labels,
         "outcomes": outcome_names,
         "parameters": parameters,
@@ -244,9 +248,9 @@ def _box_columns(rows: pd.DataFrame) -> dict[str, Any]:
         pixels = rows[list(CORNERS)].to_numpy()
         steps = (BOX_STEPS * pixels).clip(0, NO_BOX - 1).round()
         columns["boxes"] = np.where(np.isnan(pixels), NO_BOX, steps).astype(np.uint16)
-    boxes: Boxes | None = rows.attrs.get(OTHERS)
-    if boxes is not None and boxes.numbers and len(boxes.ends) == len(rows):
-        columns["others"] = np.asarray(boxes.numbers, np.uint16)
+    boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
+    if boxes is not None and boxes.values and len(boxes.ends) == len(rows):
+        columns["others"] = np.asarray(boxes.values, np.uint16)
         columns["others end"] = np.asarray(boxes.ends, np.uint32)
     return columns
 
@@ -254,7 +258,7 @@ def _box_columns(rows: pd.DataFrame) -> dict[str, Any]:
 def _encode_levels(column: pd.Series) -> tuple[Any, list[str]]:
     """Encode a column of names: return the index (n,) uint16 of each, and the names."""
     names = column.cat.categories.tolist() if column.dtype == "category" else []
-    if len(names) >= MOST_LEVELS:
-        names = [*names[: MOST_LEVELS - 1], "others"]
+    if len(names) >= MAX_LEVELS:
+        names = [*names[: MAX_LEVELS - 1], "others"]
     indices = column.cat.codes.to_numpy() if names else np.zeros(len(column))
     return np.minimum(indices, max(len(names) - 1, 0)).astype(np.uint16), names

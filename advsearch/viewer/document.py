@@ -23,7 +23,7 @@ from advsearch.trust import pages
 from advsearch.version import __version__
 
 # notes on files that are not folded
-MOST_NOTES = 3
+MAX_UNFOLDED_NOTES = 3
 
 _SUFFIXES = "|".join(suffix[1:] for suffix in (*MESHES, ".hdr", ".exr", ".xml"))
 _FILE_REMARK = re.compile(
@@ -31,7 +31,7 @@ _FILE_REMARK = re.compile(
 )
 """The beginning of remarks on how a file was read, or on a value without a control."""
 # characters of a cell above which its text is broken into lines
-LONG = 32
+MAX_CELL_LENGTH = 32
 
 SCRIPTS = (
     ("sweep.js",),
@@ -46,7 +46,7 @@ There are no other scripts, and the server allows none.
 """
 
 
-def document(
+def make_document(
     title: str,
     *body: Html | None,
     data: Sequence[Html] = (),
@@ -59,7 +59,7 @@ def document(
     Args:
         title: title of the window.
         *body: content of the page.
-        data: scripts that hold data (`data_script`).
+        data: scripts that hold data (`make_data_script`).
         scripts: names of files that run in the page, in order: one of `SCRIPTS`.
         connects: whether the page may request rows and images from its server;
             otherwise it cannot connect to anything.
@@ -80,7 +80,9 @@ def document(
         element("meta", name="color-scheme", content="light dark"),
         element("title", f"{title} - advsearch"),
         element("link", rel="icon", href="data:,"),
-        element("style", Html(f"\n{asset('document.css')}{asset('viewer.css')}")),
+        element(
+            "style", Html(f"\n{read_asset('document.css')}{read_asset('viewer.css')}")
+        ),
     )
     footer_html = element("footer", f"advsearch {__version__}, {footer or title}")
     # no line break between a number and its percent sign
@@ -97,7 +99,7 @@ def _join_scripts(scripts: Sequence[str]) -> str:
         raise ValueError(
             f"scripts: expected one of SCRIPTS, got {tuple(scripts)}; name it there"
         )
-    return "\n".join(map(asset, scripts))
+    return "\n".join(map(read_asset, scripts))
 
 
 @cache
@@ -117,17 +119,17 @@ def has_other_scripts(page: bytes) -> bool:
     return pages.has_other_scripts(page, _script_digests())
 
 
-def served_policy(*, own: bool) -> str:
+def served_policy(*, is_trusted: bool) -> str:
     """Return the `Content-Security-Policy` that a server sends: only `SCRIPTS` run."""
-    return pages.served_policy(_script_digests(), own=own)
+    return pages.served_policy(_script_digests(), own=is_trusted)
 
 
-def in_address(name: str) -> str:
+def quote_name(name: str) -> str:
     """Quote the name of a file, which may be no valid text, as a part of a URL."""
     return quote(os.fsencode(name), safe="")
 
 
-def data_script(value: object, name: str) -> Html:
+def make_data_script(value: object, name: str) -> Html:
     """Return a value as JSON in a script element, which code finds by its `id`."""
     text = (
         json.dumps(value)
@@ -138,25 +140,25 @@ def data_script(value: object, name: str) -> Html:
     return element("script", Html(text), type="application/json", id=name)
 
 
-def data_url(data: bytes, kind: str) -> str:
-    """Return bytes as a data URL; `kind` is a media type."""
-    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
+def make_data_url(data: bytes, media_type: str) -> str:
+    """Return bytes as a data URL; `media_type` is a media type."""
+    return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def scrolled(inside: Html | None, css: str = "") -> Html:
+def make_scrollable(inside: Html | None, css: str = "") -> Html:
     """Wrap an element so that it scrolls sideways if it is too wide, also by keys."""
     return element("div", inside, class_=f"scroll {css}".strip(), tabindex="0")
 
 
 @cache
-def asset(name: str) -> str:
+def read_asset(name: str) -> str:
     """Read a static file of the viewer."""
     return (resources.files("advsearch.viewer") / "static" / name).read_text(
         encoding="utf-8"
     )
 
 
-def heading(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
+def make_header(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
     """Return the header of a page: a line about its subject, the result, and remarks."""
     return element(
         "header",
@@ -174,7 +176,7 @@ def remarks_html(remarks: Sequence[str]) -> Html:
     notes = [remark for remark in remarks if _FILE_REMARK.match(remark)]
     others = [remark for remark in remarks if remark not in notes]
     notes_html = _list_html(notes, "notes")
-    if len(notes) > MOST_NOTES:
+    if len(notes) > MAX_UNFOLDED_NOTES:
         summary = element("summary", f"{len(notes)} notes on how files were read")
         notes_html = element("details", summary, notes_html)
     return join_html(_list_html(others, "remarks"), notes_html)
@@ -207,7 +209,7 @@ def facts_table(facts: Mapping[str, str]) -> Html:
     return element("table", element("tbody", *lines), class_="facts")
 
 
-def study_table(
+def make_table(
     heads: Sequence[str],
     rows: Sequence[Sequence[str]],
     links: Sequence[str] = (),
@@ -237,14 +239,16 @@ def study_table(
     bar_head = element("td", class_="hide-small") if bars else None
     column_heads = (element("th", text, scope="col") for text in heads)
     head = element("tr", *column_heads, bar_head)
-    return scrolled(element("table", element("thead", head), element("tbody", *lines)))
+    return make_scrollable(
+        element("table", element("thead", head), element("tbody", *lines))
+    )
 
 
 def _cell_class(text: str, share: float | None) -> str:
     """Return the CSS classes of a cell, which may have the color of a fraction."""
     if share is not None:
         return f"number share share-{round(10 * share)}"
-    return "number" if len(text) <= LONG else "long"
+    return "number" if len(text) <= MAX_CELL_LENGTH else "long"
 
 
 def _interval_bar(bar: tuple[float, float, float] | None) -> Html | None:
@@ -259,7 +263,7 @@ def _interval_bar(bar: tuple[float, float, float] | None) -> Html | None:
     return element("div", range_html, mark_html, class_="interval", aria_hidden="true")
 
 
-def part_links(run: Path, parts: Sequence[str | None]) -> list[str]:
+def link_parts(run: Path, parts: Sequence[str | None]) -> list[str]:
     """Return the addresses of the pages of a run's parts, relative to its own page.
 
     They are empty of parts that have no page.
@@ -268,5 +272,5 @@ def part_links(run: Path, parts: Sequence[str | None]) -> list[str]:
     for part in parts:
         name = "" if part is None else Path(part).name
         has_page = bool(name) and (run / PARTS / name / REPORT).is_file()
-        links.append(f"{PARTS}/{in_address(name)}/{REPORT}" if has_page else "")
+        links.append(f"{PARTS}/{quote_name(name)}/{REPORT}" if has_page else "")
     return links

@@ -28,25 +28,27 @@ from advsearch.runs.directory import CONFIG, IMAGES, OBJECT_FILE, REPORT, RunDir
 from advsearch.runs.files import smaller_png
 from advsearch.runs.results import Result
 from advsearch.runs.summary import read_result
-from advsearch.settings import python_only_text
+from advsearch.settings import format_python_only
 from advsearch.trust.named_files import is_inside
 from advsearch.trust.stored_files import read_bytes
 from advsearch.trust.writing import write_text
 from advsearch.viewer import document
 
 # maximum bytes of an image that is embedded
-LARGEST_FIGURE = 2_000_000
+MAX_FIGURE_BYTES = 2_000_000
 # maximum bytes of a PNG that is read to be scaled down
-LARGEST_PNG = 50_000_000
-LARGE_PICTURE = 1_000_000
+MAX_PNG_BYTES = 50_000_000
+MAX_UNSCALED_BYTES = 1_000_000
 """Bytes above which a PNG is scaled down in the page; its file stays as it is."""
 # longest side of a PNG that is scaled down, pixels
-SMALLER_SIDE = 640
+MAX_SCALED_SIZE = 640
 # media types of images
-KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
+MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 
 
-def kept(run: Path, name: str | Path, largest: int = LARGEST_FIGURE) -> Path | None:
+def find_image(
+    run: Path, name: str | Path, max_bytes: int = MAX_FIGURE_BYTES
+) -> Path | None:
     """Return an image file of a run, None if it is missing, outside of it or too large.
 
     Names come from a summary, which may name any file.
@@ -54,27 +56,27 @@ def kept(run: Path, name: str | Path, largest: int = LARGEST_FIGURE) -> Path | N
     file = run / name
     if not is_inside(file, run) or not file.is_file():
         return None
-    return file if file.stat().st_size <= largest else None
+    return file if file.stat().st_size <= max_bytes else None
 
 
-def part_html(run: Path, one: ResultPart, said: str) -> Html:
+def make_part(run: Path, part: ResultPart, description: str) -> Html:
     """Return a part of a result as HTML; a folded one opens at its title.
 
-    `said` describes the chart of a part without text of its own.
+    `description` describes the chart of a part without text of its own.
     """
-    content = _part_content(run, one, said)
-    title = element("h2", one.title) if one.title else None
-    if one.live:
+    content = _part_content(run, part, description)
+    title = element("h2", part.title) if part.title else None
+    if part.live:
         return element(
             "div",
             title,
-            element("div", id=one.live),
+            element("div", id=part.live),
             content,
             hidden="hidden",
             class_="screen",
         )
-    if one.folded:
-        return element("details", element("summary", one.title), content)
+    if part.folded:
+        return element("details", element("summary", part.title), content)
     return join_html(title, content)
 
 
@@ -93,9 +95,9 @@ def _part_content(run: Path, part: ResultPart, description: str) -> Html:
         alt = " ".join(part.text) or part.title
         content.append(_embed_figure(run, part.figure, alt))
     if part.rows and part.heads:
-        links = document.part_links(run, part.parts)
+        links = document.link_parts(run, part.parts)
         content.append(
-            document.study_table(part.heads, part.rows, links, part.shares, part.bars)
+            document.make_table(part.heads, part.rows, links, part.shares, part.bars)
         )
     elif part.rows:
         content.append(document.facts_table({row[0]: row[1] for row in part.rows}))
@@ -111,15 +113,17 @@ def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | No
     figures = []
     for picture in group:
         is_png = picture.file.lower().endswith(".png")
-        file = kept(run, picture.file, LARGEST_PNG if is_png else LARGEST_FIGURE)
+        file = find_image(
+            run, picture.file, MAX_PNG_BYTES if is_png else MAX_FIGURE_BYTES
+        )
         if file is None:
             continue
         data = file.read_bytes()
-        if is_png and len(data) > LARGE_PICTURE:
-            data = smaller_png(data, SMALLER_SIDE)
+        if is_png and len(data) > MAX_UNSCALED_BYTES:
+            data = smaller_png(data, MAX_SCALED_SIZE)
         image = element(
             "img",
-            src=document.data_url(data, KINDS[file.suffix.lower()]),
+            src=document.make_data_url(data, MEDIA_TYPES[file.suffix.lower()]),
             alt=": ".join(filter(None, (picture.name, picture.caption))),
             data_picture=file.stem,
         )
@@ -135,23 +139,23 @@ def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | No
 
 def _embed_figure(run: Path, name: str, alt: str) -> Html | None:
     """Return a wide figure, None without a file that can be embedded."""
-    file = kept(run, name) if name else None
+    file = find_image(run, name) if name else None
     if file is None:
         return None
     image = element(
-        "img", src=document.data_url(file.read_bytes(), "image/png"), alt=alt
+        "img", src=document.make_data_url(file.read_bytes(), "image/png"), alt=alt
     )
-    return element("figure", document.scrolled(image, "wide"), class_="wide")
+    return element("figure", document.make_scrollable(image, "wide"), class_="wide")
 
 
-def end_html(run: Path, result: Result, given: ShownResult) -> Html:
+def make_end(run: Path, result: Result, view: ShownResult) -> Html:
     """Return the end of a page: cost and conditions, commands, and all settings.
 
     The commands resume a run that was stopped, and repeat it.
     """
     facts = {
         name[:1].upper() + name[1:]: text
-        for name, text in views.facts_of(result, given).items()
+        for name, text in views.facts_of(result, view).items()
     }
     content = [element("h2", "Cost and conditions"), document.facts_table(facts)]
     if result.goes_on:
@@ -161,7 +165,7 @@ def end_html(run: Path, result: Result, given: ShownResult) -> Html:
     python_only = getattr(result, "python_only", [])
     repeat = ""
     if python_only:
-        repeat = f"No command repeats this: {python_only_text(python_only)}"
+        repeat = f"No command repeats this: {format_python_only(python_only)}"
     elif config_file.is_file():
         repeat = shlex.join(["advsearch", "run", str(config_file)])
     if repeat:
@@ -177,7 +181,7 @@ def end_html(run: Path, result: Result, given: ShownResult) -> Html:
 
 AnyResult = TypeVar("AnyResult", bound=Result)
 # maximum bytes of an object that is embedded
-LARGEST = 2_700_000
+MAX_OBJECT_BYTES = 2_700_000
 _HINT = (
     "Drag it, or choose it and press the arrow keys. It is lit evenly here, not "
     "by the scene's light."
@@ -187,13 +191,13 @@ _HINT = (
 def read_object(run: Path) -> bytes:
     """Read a run's object as binary glTF; empty if there is none that can be embedded."""
     try:
-        data = read_bytes(run / OBJECT_FILE, "an object to turn", LARGEST)
+        data = read_bytes(run / OBJECT_FILE, "an object to turn", MAX_OBJECT_BYTES)
     except (OSError, FileFormatError):
         return b""
     return data if _read_header(data) else b""
 
 
-def object_part(data: bytes) -> ResultPart:
+def make_object_part(data: bytes) -> ResultPart:
     """Return the part in which a script draws the object; empty without an object."""
     if not data:
         return ResultPart()
@@ -206,12 +210,12 @@ def object_part(data: bytes) -> ResultPart:
     )
 
 
-def object_data(data: bytes) -> list[Html]:
+def make_object_data(data: bytes) -> list[Html]:
     """Return the object as data of a page, empty without an object."""
     if not data:
         return []
     text = base64.b64encode(data).decode("ascii")
-    return [document.data_script(text, "object-file")]
+    return [document.make_data_script(text, "object-file")]
 
 
 def _read_header(data: bytes) -> dict[str, dict[str, object]]:
@@ -235,11 +239,11 @@ def write_page(run: Path, result: Result | None = None) -> Path:
         FileFormatError: if results of the run are corrupt.
         StorageError: if the page cannot be written.
     """
-    page = page_of(run, result or read_result(run))
+    page = make_run_page(run, result or read_result(run))
     return write_text(run / REPORT, page, durable=False)
 
 
-def page_of(run: Path, result: Result) -> str:
+def make_run_page(run: Path, result: Result) -> str:
     """Return the page of a run, which needs no other files but those of its parts.
 
     Raises:
@@ -247,10 +251,10 @@ def page_of(run: Path, result: Result) -> str:
     """
     make_page = registry.get_experiment(result.command).page
     page: str | None = make_page(run, result) if make_page else None
-    return page or shown_page(run, result, views.shown(result))
+    return page or make_view_page(run, result, views.shown(result))
 
 
-def keep_result(run: RunDirectory, result: AnyResult) -> AnyResult:
+def write_result(run: RunDirectory, result: AnyResult) -> AnyResult:
     """Write the page and the summary of a result into the directory of its run.
 
     The summary is the last file: a run whose disk was full before counts as unfinished,
@@ -261,10 +265,10 @@ def keep_result(run: RunDirectory, result: AnyResult) -> AnyResult:
     return result
 
 
-def shown_page(
+def make_view_page(
     run: Path,
     result: Result,
-    given: ShownResult,
+    view: ShownResult,
     *,
     data: Sequence[Html] = (),
     scripts: Sequence[str] = (),
@@ -274,31 +278,31 @@ def shown_page(
     Args:
         run: directory of the run.
         result: its result.
-        given: the view of the result.
+        view: the view of the result.
         data: scripts that hold data.
         scripts: files that fill the parts that are `live`.
     """
     content = list[Html | None]()
     # an experiment that names no figures shows all of its images
-    if not any(part.draw or part.figure or part.pictures for part in given.sections):
+    if not any(part.draw or part.figure or part.pictures for part in view.sections):
         for file in sorted((run / IMAGES).glob("*.png")):
             name = file.stem.replace("-", " ").replace("_", " ").capitalize()
-            alt = f"{name}: {given.said}"
+            alt = f"{name}: {view.said}"
             content.append(_embed_figure(run, f"{IMAGES}/{file.name}", alt))
-    for part in given.sections:
+    for part in view.sections:
         if part.only in ("", "page") and not part.empty:
-            content.append(part_html(run, part, given.said))
+            content.append(make_part(run, part, view.said))
     content.append(_list_parts(run, list(getattr(result, "parts", ()))))
-    subject = views.subject_of(result, given)
+    subject = views.subject_of(result, view)
     eyebrow = join_html(
         result.command,
         "; " if subject else None,
         document.subject_html(*(("", name) for name in subject)),
     )
-    return document.document(
+    return document.make_document(
         f"{run.name}, {result.command}",
-        document.heading(eyebrow, given.said, views.remarks_of(result, given)),
-        element("main", *content, end_html(run, result, given)),
+        document.make_header(eyebrow, view.said, views.remarks_of(result, view)),
+        element("main", *content, make_end(run, result, view)),
         data=data,
         scripts=scripts,
         footer=f"run {run.name}. This page needs no other file.",
@@ -311,7 +315,7 @@ def _list_parts(run: Path, parts: list[object]) -> Html | None:
     if not parts or len(names) < len(parts):
         return None
     items = []
-    for name, link in zip(names, document.part_links(run, names), strict=True):
+    for name, link in zip(names, document.link_parts(run, names), strict=True):
         items.append(element("li", element("a", name, href=link) if link else name))
     summary = element("summary", f"The runs ({len(names)})")
     return element("details", summary, element("ul", *items))

@@ -32,7 +32,11 @@ from typing import Any, NamedTuple, Protocol
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from advsearch.errors import AdvsearchError, InputError
-from advsearch.questions.sweep.page import SweepSource, result_of, sweep_page_html
+from advsearch.questions.sweep.page import (
+    SweepSource,
+    load_sweep_result,
+    make_sweep_page,
+)
 from advsearch.report import wording
 from advsearch.report.views import Html, element, join_html
 from advsearch.runs import directory, listing, store
@@ -43,23 +47,34 @@ from advsearch.trust.pages import CLOSED, LOOPBACK, Refused, check_request, toke
 from advsearch.trust.stored_files import read_bytes
 from advsearch.trust.writing import is_held
 from advsearch.viewer import clients
-from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, reachable
-from advsearch.viewer.columns import packed, read_columns
+from advsearch.viewer.clients import (
+    CHECK_INTERVAL,
+    MIN_BYTES_PER_SECOND,
+    REQUEST_SECONDS,
+    ConnectionPool,
+    find_reachable_address,
+)
+from advsearch.viewer.columns import pack_columns, read_columns
 from advsearch.viewer.document import (
-    data_script,
-    data_url,
-    document,
     has_other_scripts,
-    in_address,
-    scrolled,
+    make_data_script,
+    make_data_url,
+    make_document,
+    make_scrollable,
+    quote_name,
     served_policy,
 )
-from advsearch.viewer.thumbnails import cover, kept_pictures, read_thumbnail, thumbnail
+from advsearch.viewer.thumbnails import (
+    find_thumbnails,
+    make_cover,
+    make_thumbnail,
+    read_thumbnail,
+)
 
 # ---- Pages of the dashboard alone: the list of runs, and a run in progress or stopped
 
 
-def list_page(runs: Mapping[str, Path]) -> str:
+def make_list_page(runs: Mapping[str, Path]) -> str:
     """Return the page that lists runs (directories by name), the newest first."""
     listed = [
         (name, listing.listed_run(path, counts=False)) for name, path in runs.items()
@@ -84,17 +99,17 @@ def list_page(runs: Mapping[str, Path]) -> str:
     if listed:
         content = element(
             "form",
-            scrolled(table),
+            make_scrollable(table),
             button if can_compare else None,
             action="compare/",
         )
     title = element("header", element("h1", "Runs"))
-    return document("Runs", title, element("main", content), connects=True)
+    return make_document("Runs", title, element("main", content), connects=True)
 
 
 def _run_row(name: str, run: listing.Listed, can_compare: bool) -> Html:
     """Return the row of a run in the list."""
-    address = f"runs/{in_address(name)}/"
+    address = f"runs/{quote_name(name)}/"
     cells = []
     if can_compare:
         checkbox = None
@@ -153,12 +168,12 @@ def _run_subject(name: str, run: listing.Listed, address: str) -> Html:
 
 
 # maximum evaluations in one response; the page requests the rest
-MOST_ROWS = 2000
+MAX_PROGRESS_ROWS = 2000
 # the last row that a new page has
-START = 0
+FIRST_ROW_ID = 0
 
 
-def is_under_way(run: Path) -> bool:
+def is_unfinished(run: Path) -> bool:
     """Return whether a run has no page of its result.
 
     It has none at all, or one of an attack that is being resumed.
@@ -166,7 +181,7 @@ def is_under_way(run: Path) -> bool:
     return not (run / REPORT).is_file() or (is_held(run) and listing.can_resume(run))
 
 
-def following_page(name: str, run: Path) -> str:
+def make_progress_page(name: str, run: Path) -> str:
     """Return the page that follows a run's progress, by its name in the dashboard.
 
     Without its script it shows the progress at the time of the request.
@@ -180,7 +195,7 @@ def following_page(name: str, run: Path) -> str:
     attacks = []
     for path in sorted((run / PARTS).glob("*")):  # attacks of a study
         if path.is_dir():
-            address = f"{PARTS}/{in_address(path.name)}/{REPORT}"
+            address = f"{PARTS}/{quote_name(path.name)}/{REPORT}"
             link = element("a", path.name, href=address)
             has_page = (path / REPORT).is_file()
             attacks.append(element("li", link if has_page else path.name))
@@ -201,41 +216,41 @@ def following_page(name: str, run: Path) -> str:
         element("div", id="follow"),
         attack_list,
     )
-    return document(
+    return make_document(
         name,
         header,
         main,
-        data=[data_script({"progress": "progress", "start": START}, "run")],
+        data=[make_data_script({"progress": "progress", "start": FIRST_ROW_ID}, "run")],
         scripts=["make.js", "follow.js"],
         connects=True,
         footer=f"run {name}",
     )
 
 
-def progress_json(run: Path, after: int) -> bytes:
+def make_progress_json(run: Path, after: int) -> bytes:
     """Return what is new in a run as JSON.
 
     Args:
         run: directory of the run.
-        after: `next` of the previous response, or `START`.
+        after: `next` of the previous response, or `FIRST_ROW_ID`.
 
     Raises:
         FileFormatError: if the stored results are corrupt.
     """
     # before the rows are read: later ones are requested next time
     running = is_held(run)
-    ended = not is_under_way(run)
+    ended = not is_unfinished(run)
     last = after
     rows = list[dict[str, object]]()
     pictures = list[dict[str, object]]()
     if (run / store.NAME).is_file():
         with store.Store(run / store.NAME, read_only=True) as results:
-            for row in islice(results.rows(after=after), MOST_ROWS):
+            for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
                 rows.append(_row_json(row))
                 last = row.id or after
             for number, picture in results.pictures("search", after, last):
-                jpeg = thumbnail(picture.astype("float32") / 255.0)
-                url = data_url(jpeg, "image/jpeg")
+                jpeg = make_thumbnail(picture.astype("float32") / 255.0)
+                url = make_data_url(jpeg, "image/jpeg")
                 pictures.append({"step": number, "picture": url})
     progress = {
         "rows": rows,
@@ -259,28 +274,30 @@ def _row_json(row: store.Row) -> dict[str, object]:
     return {**fields, "values": values}
 
 
-FIRST_PART = 4_000
-PART = 50_000
+FIRST_ROWS = 4_000
+MAX_ROWS = 50_000
 """Rows of a sweep in one response: of the first, which people wait for, and of others."""
 # maximum bytes of a sweep's columns, and of a run's page
-LARGEST = 1 << 30
-LARGEST_PAGE = 1 << 28
+MAX_COLUMNS_BYTES = 1 << 30
+MAX_PAGE_BYTES = 1 << 28
 # seconds in which a photograph has to arrive
-SENDING = 60.0
-FAULT = "this page could not be made, which is a fault of advsearch"
+UPLOAD_SECONDS = 60.0
+FAULT_MESSAGE = "this page could not be made, which is a fault of advsearch"
 # connections that may wait in the operating system
 BACKLOG = 4096
 # directory and file of a thumbnail
-NUMBERED = re.compile(r"[0-9]+/[0-9]{1,12}\.jpg")
+THUMBNAIL_PATH = re.compile(r"[0-9]+/[0-9]{1,12}\.jpg")
 
 
 class PhotographServer(Protocol):
     """What responds for the page on which photographs are aligned with a run's renderings."""
 
-    def make_page(self, run: Path, name: str, key: str, elsewhere: str | None) -> str:
+    def make_page(
+        self, run: Path, name: str, key: str, other_device_url: str | None
+    ) -> str:
         """Return the page as HTML.
 
-        `elsewhere` is its address for another device, if one can open it.
+        `other_device_url` is its address for another device, if one can open it.
         """
 
     def read_picture(self, kind: str, run: Path, name: str) -> tuple[str, bytes]:
@@ -290,7 +307,7 @@ class PhotographServer(Protocol):
             Refused: if there is none.
         """
 
-    def take(
+    def store_photograph(
         self,
         run: Path,
         name: str,
@@ -312,7 +329,7 @@ class Dashboard(HTTPServer):
     on this machine. `fingerprint` is SHA-256 of the certificate, None without HTTPS.
 
     Args:
-        runs: directories of runs; without, those in ``runs/``.
+        list_runs: directories of runs; without, those in ``runs/``.
         host: address to listen at; one beyond this machine always has HTTPS.
         port: port to listen at, 0 for a free one.
         https: whether to use HTTPS on this machine too.
@@ -346,15 +363,15 @@ class Dashboard(HTTPServer):
         self._secret = secrets.token_bytes(32)
         self.photographs = photographs
         self._listing = threading.Lock()
-        self.named = host
+        self.host_name = host
         self.fingerprint = None
         self._context: ssl.SSLContext | None = None
         if https or self.token:
             self._context, self.fingerprint = https_context(
-                (reachable(host), "localhost", LOOPBACK)
+                (find_reachable_address(host), "localhost", LOOPBACK)
             )
         super().__init__((host, port), _Handler, bind_and_activate=False)
-        self.clients = Clients(self.socket, self.finish_request, self._context)
+        self.clients = ConnectionPool(self.socket, self.finish_request, self._context)
         try:
             self.server_bind()
             self.server_activate()
@@ -370,17 +387,17 @@ class Dashboard(HTTPServer):
 
     @property
     def address(self) -> str:
-        return self.address_of("/")
+        return self.make_url("/")
 
-    def address_of(self, path: str) -> str:
+    def make_url(self, path: str) -> str:
         """Return the URL of a page for a browser on this or another machine."""
-        host = reachable(self.named)
+        host = find_reachable_address(self.host_name)
         if ":" in host:  # IPv6
             host = f"[{host}]"
         url = f"{self.scheme}://{host}:{self.server_port}{path}"
         return f"{url}?token={self.token}" if self.token else url
 
-    def runs(self) -> Mapping[str, Path]:
+    def list_runs(self) -> Mapping[str, Path]:
         """Return the directories of the runs by name."""
         if self._explicit_runs:
             return self._explicit_runs
@@ -389,7 +406,7 @@ class Dashboard(HTTPServer):
         )
         return {path.name: path for path in paths}
 
-    def run(self, name: str) -> Path:
+    def find_run(self, name: str) -> Path:
         """Return the directory of a run.
 
         Raises:
@@ -419,16 +436,16 @@ class Dashboard(HTTPServer):
             )
         return self.photographs
 
-    def key(self, name: str) -> str:
+    def make_key(self, name: str) -> str:
         """Return the key that a photograph of a run needs, and only its page has."""
         return hmac.new(self._secret, os.fsencode(name), "sha256").hexdigest()
 
-    def list_page(self) -> str:
+    def make_list_page(self) -> str:
         """Return the page that lists the runs."""
         with self._listing:  # one thread reads, the others find what it has cached
-            return list_page(self.runs())
+            return make_list_page(self.list_runs())
 
-    def serve_forever(self, poll_interval: float = TICK) -> None:
+    def serve_forever(self, poll_interval: float = CHECK_INTERVAL) -> None:
         """Respond to requests until `shutdown`."""
         self.clients.serve()
 
@@ -442,18 +459,18 @@ class Dashboard(HTTPServer):
 
 
 Query = Mapping[str, list[str]]
-OTHERS = served_policy(own=False)
+UNTRUSTED_POLICY = served_policy(is_trusted=False)
 
 
-class Served(NamedTuple):
+class Response(NamedTuple):
     """A response: media type, data and policy.
 
     By default the policy is that of untrusted content, such as files of a run.
     """
 
-    kind: str
+    media_type: str
     data: bytes
-    policy: str = OTHERS
+    policy: str = UNTRUSTED_POLICY
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -471,17 +488,17 @@ class _Handler(BaseHTTPRequestHandler):
         """Respond to a request; any error becomes a response."""
         headers: dict[str, str] = {}
         status = HTTPStatus.OK
-        self.server.clients.wait_for(None)
+        self.server.clients.report_waiting(None)
         try:
             self._check_request()
             response, headers = self._respond()
         except Exception as error:  # an error of one page must not end the server
             status, text = _describe_error(error)
             data = f"{text}\n".encode("utf-8", "replace")
-            response = Served("text/plain; charset=utf-8", data)
+            response = Response("text/plain; charset=utf-8", data)
         self.send_response(status)
         for name, value in {
-            "Content-Type": response.kind,
+            "Content-Type": response.media_type,
             "Content-Length": str(len(response.data)),
             "Content-Security-Policy": response.policy,
             "Cache-Control": "no-store",
@@ -489,7 +506,9 @@ class _Handler(BaseHTTPRequestHandler):
             **headers,
         }.items():
             self.send_header(name, value)
-        self.server.clients.wait_for(PATIENCE + len(response.data) / SLOWEST)
+        self.server.clients.report_waiting(
+            REQUEST_SECONDS + len(response.data) / MIN_BYTES_PER_SECOND
+        )
         self.end_headers()
         if self.command != "HEAD":
             self.wfile.write(response.data)
@@ -504,12 +523,12 @@ class _Handler(BaseHTTPRequestHandler):
             self.path,
             self.headers,
             server.scheme,
-            server.named,
+            server.host_name,
             server.server_port,
             server.token,
         )
 
-    def _respond(self) -> tuple[Served, dict[str, str]]:
+    def _respond(self) -> tuple[Response, dict[str, str]]:
         """Return the response to a request, and headers to send with it."""
         if not self.path.startswith("/"):
             raise Refused(HTTPStatus.BAD_REQUEST, "this server is no proxy")
@@ -529,87 +548,91 @@ class _Handler(BaseHTTPRequestHandler):
             return self._take_photograph(parts), headers
         return self._route(query, parts), headers
 
-    def _take_photograph(self, parts: list[str]) -> Served:
+    def _take_photograph(self, parts: list[str]) -> Response:
         """Respond to a POST request; only photographs are accepted."""
         match parts:
             case ["runs", name, "align", "renderings", file]:
-                run = self.server.run(name)
-                kind, data = self.server.photograph_pages.take(
-                    run, file, self.headers, self.server.key(name), self._read_body
+                run = self.server.find_run(name)
+                kind, data = self.server.photograph_pages.store_photograph(
+                    run, file, self.headers, self.server.make_key(name), self._read_body
                 )
-                return Served(kind, data)
+                return Response(kind, data)
         raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
 
-    def _route(self, query: Query, parts: list[str]) -> Served:
+    def _route(self, query: Query, parts: list[str]) -> Response:
         """Respond to a GET request by the parts of its path."""
         server = self.server
         match parts:
             case [""]:
-                return _serve_page(server.list_page())
+                return _serve_page(server.make_list_page())
             case ["compare", ""]:
                 return self._serve_comparison(query)
             case ["runs", name, ""]:
                 return self._serve_run(name)
             case ["runs", name, "cover"]:
-                return Served("image/jpeg", cover(server.run(name)))
+                return Response("image/jpeg", make_cover(server.find_run(name)))
             case ["runs", name, "rows"]:
-                return self._serve_rows(query, server.run(name))
+                return self._serve_rows(query, server.find_run(name))
             case ["runs", name, "progress"]:
-                progress = progress_json(server.run(name), _parse_after(query))
-                return Served("application/json", progress)
+                progress = make_progress_json(
+                    server.find_run(name), _parse_after(query)
+                )
+                return Response("application/json", progress)
             # a part of a study, whose page links to it
             case ["runs", name, directory.PARTS, part, directory.REPORT]:
                 return self._serve_part(name, part)
-            case ["runs", name, "pictures", folder, file] if NUMBERED.fullmatch(
+            case ["runs", name, "pictures", folder, file] if THUMBNAIL_PATH.fullmatch(
                 f"{folder}/{file}"
             ):
                 number = int(file.removesuffix(".jpg"))
-                return Served("image/jpeg", read_thumbnail(server.run(name), number))
+                return Response(
+                    "image/jpeg", read_thumbnail(server.find_run(name), number)
+                )
             case ["runs", name, "align", ""]:
                 return self._serve_photograph_page(name)
             case ["runs", name, "align", ("renderings" | "photos") as kinds, file]:
                 kind, data = server.photograph_pages.read_picture(
-                    kinds.removesuffix("s"), server.run(name), file
+                    kinds.removesuffix("s"), server.find_run(name), file
                 )
-                return Served(kind, data)
+                return Response(kind, data)
         raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
 
-    def _serve_run(self, name: str) -> Served:
+    def _serve_run(self, name: str) -> Response:
         """Return the page of a run: of a sweep, a run in progress, or a finished one."""
-        run = self.server.run(name)
+        run = self.server.find_run(name)
         if listing.listed_run(run, counts=False).command == "sweep":
-            page = sweep_page_html(
-                [(run, result_of(run))], [_make_source(name, run, "")]
+            page = make_sweep_page(
+                [(run, load_sweep_result(run))], [_make_source(name, run, "")]
             )
             return _serve_page(page, "../../")
-        if is_under_way(run):
-            return _serve_page(following_page(name, run), "../../")
+        if is_unfinished(run):
+            return _serve_page(make_progress_page(name, run), "../../")
         return _serve_stored_page(run, "../../")
 
-    def _serve_part(self, name: str, part: str) -> Served:
+    def _serve_part(self, name: str, part: str) -> Response:
         """Return the stored page of a part of a run, such as an attack of a study."""
-        for path in (self.server.run(name) / PARTS).iterdir():
+        for path in (self.server.find_run(name) / PARTS).iterdir():
             if path.name == part:
                 if (path / REPORT).is_file():
                     return _serve_stored_page(path, "../../../../", ("../../", name))
                 break
         raise Refused(HTTPStatus.NOT_FOUND, "there is no such attack")
 
-    def _serve_photograph_page(self, name: str) -> Served:
+    def _serve_photograph_page(self, name: str) -> Response:
         """Return the page on which photographs are aligned with a run's renderings."""
-        run = self.server.run(name)
+        run = self.server.find_run(name)
         elsewhere = None
         if self.server.token:
-            elsewhere = self.server.address_of(f"/runs/{in_address(name)}/align/")
+            elsewhere = self.server.make_url(f"/runs/{quote_name(name)}/align/")
         page = self.server.photograph_pages.make_page(
-            run, name, self.server.key(name), elsewhere
+            run, name, self.server.make_key(name), elsewhere
         )
         return _serve_page(page, "../../../", ("../", name))
 
-    def _serve_comparison(self, query: Query) -> Served:
+    def _serve_comparison(self, query: Query) -> Response:
         """Return a page of several sweeps side by side."""
         names = dict.fromkeys(query.get("run", []))
-        runs = [(name, self.server.run(name)) for name in names]
+        runs = [(name, self.server.find_run(name)) for name in names]
         if not runs:
             raise Refused(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
         others = [
@@ -623,25 +646,29 @@ class _Handler(BaseHTTPRequestHandler):
                 f"only sweeps can be shown side by side; {', '.join(others)} is none",
             )
         sources = [
-            _make_source(name, run, f"../runs/{in_address(name)}/")
+            _make_source(name, run, f"../runs/{quote_name(name)}/")
             for name, run in runs
         ]
-        page = sweep_page_html([(run, result_of(run)) for _, run in runs], sources)
+        page = make_sweep_page(
+            [(run, load_sweep_result(run)) for _, run in runs], sources
+        )
         return _serve_page(page, "../")
 
-    def _serve_rows(self, query: Query, run: Path) -> Served:
+    def _serve_rows(self, query: Query, run: Path) -> Response:
         """Return rows of a sweep as columns; those of a finished one may be stored."""
         media_type = "application/octet-stream"
         after = _parse_after(query)
         if not after and (run / COLUMNS).is_file() and listing.finished(run):
-            stored = read_bytes(run / COLUMNS, "columns of a sweep", LARGEST)
-            return Served(media_type, stored)
-        max_rows = PART if after else FIRST_PART
+            stored = read_bytes(run / COLUMNS, "columns of a sweep", MAX_COLUMNS_BYTES)
+            return Response(media_type, stored)
+        max_rows = MAX_ROWS if after else FIRST_ROWS
         # before the rows are read: later ones are requested next time
         running = is_held(run)
         rows = read_columns(run, after, max_rows)
         has_more = len(rows) == max_rows
-        return Served(media_type, packed(rows, more=has_more, running=running))
+        return Response(
+            media_type, pack_columns(rows, has_more=has_more, is_running=running)
+        )
 
     def _read_body(self) -> bytes:
         """Read the body of a request.
@@ -652,14 +679,14 @@ class _Handler(BaseHTTPRequestHandler):
         length = self.headers.get("Content-Length", "")
         if not re.fullmatch(r"[0-9]{1,15}", length):
             raise Refused(HTTPStatus.LENGTH_REQUIRED, "its length is missing")
-        if int(length) > clients.LARGEST_SENT:
+        if int(length) > clients.MAX_BODY_BYTES:
             raise Refused(
                 HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-                f"more than {clients.LARGEST_SENT >> 20} MB",
+                f"more than {clients.MAX_BODY_BYTES >> 20} MB",
             )
-        self.server.clients.wait_for(SENDING)
+        self.server.clients.report_waiting(UPLOAD_SECONDS)
         data = self.rfile.read(int(length))
-        self.server.clients.wait_for(None)
+        self.server.clients.report_waiting(None)
         if len(data) < int(length):
             raise Refused(HTTPStatus.BAD_REQUEST, "a part of it did not come")
         return data
@@ -667,7 +694,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 def _parse_after(query: Query) -> int:
     """Return the id of the row after which rows are requested."""
-    after = query.get("after", [str(START)])[0]
+    after = query.get("after", [str(FIRST_ROW_ID)])[0]
     if not re.fullmatch(r"[0-9]{1,15}", after):
         raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
     return int(after)
@@ -681,7 +708,7 @@ def _describe_error(error: Exception) -> tuple[HTTPStatus, str]:
         return HTTPStatus.INTERNAL_SERVER_ERROR, str(error)
     if isinstance(error, OSError):
         return HTTPStatus.NOT_FOUND, "it is not there any more"
-    text = f"{FAULT}: {type(error).__name__}"
+    text = f"{FAULT_MESSAGE}: {type(error).__name__}"
     return HTTPStatus.INTERNAL_SERVER_ERROR, text
 
 
@@ -693,9 +720,9 @@ def _make_source(name: str, run: Path, base: str) -> SweepSource:
     return SweepSource(
         name,
         f"{base}rows",
-        parts=True,
-        pictures=kept_pictures(run),
-        folder=f"{base}pictures",
+        is_partial=True,
+        thumbnails=find_thumbnails(run),
+        thumbnail_address=f"{base}pictures",
     )
 
 
@@ -704,26 +731,26 @@ HTML = "text/html; charset=utf-8"
 
 def _serve_page(
     page: str, home: str | None = None, above: tuple[str, str] | None = None
-) -> Served:
+) -> Response:
     """Return a page that the server has made; for arguments see `_add_navigation`."""
     data = page.encode("utf-8", "replace")  # names of files may be no text
     if home:
         data = _add_navigation(data, home, above)
-    return Served(HTML, data, served_policy(own=True))
+    return Response(HTML, data, served_policy(is_trusted=True))
 
 
 def _serve_stored_page(
     run: Path, home: str, above: tuple[str, str] | None = None
-) -> Served:
+) -> Response:
     """Return the stored page of a run; for arguments see `_add_navigation`."""
-    page = read_bytes(run / REPORT, "a page", LARGEST_PAGE)
+    page = read_bytes(run / REPORT, "a page", MAX_PAGE_BYTES)
     remark = None
     if has_other_scripts(page):
         remark = (
             "Its scripts are of another advsearch and do not run here; advsearch view "
             f"{run.name} makes the page anew."
         )
-    return Served(HTML, _add_navigation(page, home, above, remark))
+    return Response(HTML, _add_navigation(page, home, above, remark))
 
 
 def _add_navigation(

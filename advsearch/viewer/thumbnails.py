@@ -27,26 +27,26 @@ if TYPE_CHECKING:
 
 
 # images in each directory
-A_FOLDER = 1000
+IMAGES_PER_DIRECTORY = 1000
 # longest side of a thumbnail, pixels
-SIDE = 128
+THUMBNAIL_SIZE = 128
 # of JPEG files, from 1 to 95
-QUALITY = 85
+JPEG_QUALITY = 85
 # maximum pixels of an image that is scaled down for the list of runs
-LARGEST_COVER = 50_000_000
+MAX_COVER_PIXELS = 50_000_000
 # maximum bytes of the file of a thumbnail
-LARGEST = 1 << 24
+MAX_THUMBNAIL_BYTES = 1 << 24
 # about the bytes of a thumbnail, measured on images of the bundled objects
-BYTES = 5000
+TYPICAL_BYTES = 5000
 
 
-def thumbnail(picture: object) -> bytes:
-    """Encode a display-referred image (H, W, 3) in [0, 1] as a JPEG of at most `SIDE` pixels."""
+def make_thumbnail(picture: object) -> bytes:
+    """Encode a display-referred image (H, W, 3) in [0, 1] as a JPEG of at most `THUMBNAIL_SIZE` pixels."""
     values: Bytes = to_8bit(picture)
     return _encode_jpeg(Image.fromarray(values))
 
 
-def cover(run: Path) -> bytes:
+def make_cover(run: Path) -> bytes:
     """Return a small image of a run as a JPEG; gray if it has none.
 
     That is its worst prediction, or else its first figure.
@@ -58,7 +58,7 @@ def cover(run: Path) -> bytes:
         if not file.is_file():
             continue
         with suppress(*BAD_PICTURE), Image.open(file, formats=("PNG",)) as image:
-            if image.width * image.height <= LARGEST_COVER:
+            if image.width * image.height <= MAX_COVER_PIXELS:
                 return _encode_jpeg(image.convert("RGB"))
     return _encode_jpeg(Image.new("RGB", (1, 1), (128, 128, 128)))
 
@@ -66,22 +66,24 @@ def cover(run: Path) -> bytes:
 def _encode_jpeg(image: Image.Image) -> bytes:
     """Scale an image down to a thumbnail, and encode it as a JPEG."""
     buffer = io.BytesIO()
-    image.thumbnail((SIDE, SIDE))
-    image.save(buffer, "JPEG", quality=QUALITY)
+    image.thumbnail((THUMBNAIL_SIZE, THUMBNAIL_SIZE))
+    image.save(buffer, "JPEG", quality=JPEG_QUALITY)
     return buffer.getvalue()
 
 
-def path_of(run: Path, number: int) -> Path:
+def thumbnail_path(run: Path, number: int) -> Path:
     """Return where the thumbnail of an image is stored."""
-    return run / SMALL_PICTURES / f"{number // A_FOLDER:04d}" / f"{number}.jpg"
+    return (
+        run / SMALL_PICTURES / f"{number // IMAGES_PER_DIRECTORY:04d}" / f"{number}.jpg"
+    )
 
 
-def kept_file(run: Path, number: int) -> Path | None:
+def find_thumbnail(run: Path, number: int) -> Path | None:
     """Return the file of a thumbnail, None if there is none.
 
     A link counts as none (`check_links` leaves these to this function).
     """
-    file = path_of(run, number)
+    file = thumbnail_path(run, number)
     if not file.is_file() or file.is_symlink() or file.parent.is_symlink():
         return None
     return file
@@ -94,34 +96,34 @@ def read_thumbnail(run: Path, number: int) -> bytes:
         FileNotFoundError: if there is none, or a link instead.
         FileFormatError: if it is too large.
     """
-    file = kept_file(run, number)
+    file = find_thumbnail(run, number)
     if file is None:
         raise FileNotFoundError(f"{run}: has no picture {number}")
-    return read_bytes(file, "a small picture", LARGEST)
+    return read_bytes(file, "a small picture", MAX_THUMBNAIL_BYTES)
 
 
-def keep(run: Path, number: int, data: bytes) -> None:
+def write_thumbnail(run: Path, number: int, data: bytes) -> None:
     """Store the thumbnail of an image.
 
     Raises:
         StorageError: if it cannot be written.
     """
-    write_bytes(path_of(run, number), data, durable=False)
+    write_bytes(thumbnail_path(run, number), data, durable=False)
 
 
 @dataclass(frozen=True)
-class Kept:
+class Thumbnails:
     """The thumbnails of a run.
 
     Attributes:
         run: directory of the run.
-        models: number of consecutive configurations that share an image.
-        some: whether only a subset of the images has thumbnails.
+        configurations_per_image: number of consecutive configurations that share an image.
+        is_subset: whether only a subset of the images has thumbnails.
     """
 
     run: Path
-    models: int
-    some: bool
+    configurations_per_image: int
+    is_subset: bool
 
     @cached_property
     def numbers(self) -> tuple[int, ...]:
@@ -131,14 +133,14 @@ class Kept:
         """
         return tuple(sorted(_list_numbers(self.run)))
 
-    def png_of(self, step: int) -> bytes | None:
+    def read_png(self, step: int) -> bytes | None:
         """Return the image of a configuration as a PNG, None if it was not stored.
 
         Raises:
             FileFormatError: if the file is no JPEG.
         """
         try:
-            data = read_thumbnail(self.run, step // self.models)
+            data = read_thumbnail(self.run, step // self.configurations_per_image)
         except OSError:
             return None
         stream = io.BytesIO()
@@ -146,16 +148,18 @@ class Kept:
             with Image.open(io.BytesIO(data), formats=("JPEG",)) as image:
                 image.save(stream, "PNG")
         except BAD_PICTURE:
-            file = path_of(self.run, step // self.models)
+            file = thumbnail_path(self.run, step // self.configurations_per_image)
             raise FileFormatError(
                 f"{file}: expected a small picture of the run, got something else"
             ) from None
         return stream.getvalue()
 
-    def embedded(self, rows: pd.DataFrame, most: int) -> Iterator[tuple[str, str]]:
+    def list_data_urls(
+        self, rows: pd.DataFrame, max_bytes: int
+    ) -> Iterator[tuple[str, str]]:
         """Yield number and data URL of thumbnails, those of the worst margins first.
 
-        The URLs take at most `most` bytes in all.
+        The URLs take at most `max_bytes` bytes in all.
         """
         steps = rows["step"].to_numpy()
         margins = rows["margin"].to_numpy()
@@ -163,25 +167,25 @@ class Kept:
         remaining = set(self.numbers)
         n_bytes = 0
         for step in steps[order]:
-            number = int(step) // self.models
+            number = int(step) // self.configurations_per_image
             if number not in remaining:
                 continue
             remaining.discard(number)
             data = read_thumbnail(self.run, number)
             n_bytes += len(data) * 4 // 3
-            if n_bytes > most:
+            if n_bytes > max_bytes:
                 return
             text = base64.b64encode(data).decode("ascii")
             yield str(number), f"data:image/jpeg;base64,{text}"
 
 
-def kept_pictures(run: Path) -> Kept | None:
+def find_thumbnails(run: Path) -> Thumbnails | None:
     """Return the thumbnails of a sweep, None if it has none."""
     if next(_list_numbers(run), None) is None:
         return None
     settings = read_yaml(run / CONFIG) if (run / CONFIG).is_file() else {}
     models = len(split_names(str(settings.get("model", "one"))))
-    return Kept(run, models, settings.get("keep_pictures") != "all")
+    return Thumbnails(run, models, settings.get("keep_pictures") != "all")
 
 
 def _list_numbers(run: Path) -> Iterator[int]:

@@ -128,9 +128,9 @@ def _bake(azimuth: float, elevation: float) -> tuple[Array, Array]:
             irradiance of the sun
         across its beam.
     """
-    from advsearch.scene.mitsuba_backend.variant import mitsuba
+    from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 
-    mi = mitsuba()
+    mi = import_mitsuba()
     sun = _towards(azimuth, elevation)
     spec = {
         "type": "sunsky",

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles, Floats, Material
+from advsearch.scene.assets import Float32Array, Float64Array, Material
 from advsearch.scene.color import linear_to_srgb
 from scenes.places import paint
 from scenes.places.houses import DEPTH, Fronts
@@ -263,7 +263,7 @@ def level(
     )
 
 
-def _shown(*y: float) -> Doubles:
+def _shown(*y: float) -> Float64Array:
     """Texture coordinates of the ground at y."""
     return (np.array(y) - paint.FRONTS[0]) / (paint.FRONTS[1] - paint.FRONTS[0])
 
@@ -390,7 +390,7 @@ def _tree(seed: int) -> Quads:
     return quads
 
 
-def _leaves() -> Floats:
+def _leaves() -> Float32Array:
     t = np.linspace(0.0, 1.0, 16, dtype=np.float32)[None, :, None]
     green = (
         paint.tint((0.055, 0.105, 0.022)) * (1.0 - t)
@@ -402,8 +402,8 @@ def _leaves() -> Floats:
 
 def limb(
     quads: Quads,
-    start: Doubles,
-    end: Doubles,
+    start: Float64Array,
+    end: Float64Array,
     thick: float,
     thin: float,
     sides: int = 7,
@@ -426,7 +426,7 @@ def limb(
     quads.add(corners, uvs, normals)
 
 
-def lamp_places(posts: Sequence[tuple[float, float, float]]) -> Doubles:
+def lamp_places(posts: Sequence[tuple[float, float, float]]) -> Float64Array:
     """Return where the middle of each shining area is, (N, 3) metres."""
     return np.array([(x, lamp, KERB + LAMP_HEIGHT - 0.07) for x, _, lamp in posts])
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from advsearch.scene.assets import Mesh
-from advsearch.scene.geometry import rotation
+from advsearch.scene.geometry import make_rotation
 from advsearch.scene.library import load_object
 from scenes.places import avenue, paint
 from scenes.places.avenue import (
@@ -91,7 +91,7 @@ def _sign() -> tuple[dict[str, Look], tuple[Node, ...]]:
     foot = np.array([*SIGN, KERB])
     low = np.array([*SIGN, KERB + SIGN_LOW])
     avenue.limb(post, foot, low + np.array([0.0, 0.0, 0.1]), 0.035, 0.035, 10)
-    linear = asset.metres * rotation(180.0, 0.0, 0.0)
+    linear = asset.metres * make_rotation(180.0, 0.0, 0.0)
     mesh = asset.mesh
     vertices = (mesh.vertices.astype(np.float64) @ linear.T + low).astype(np.float32)
     normals = (mesh.normals.astype(np.float64) @ linear.T / asset.metres).astype(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from advsearch.scene.assets import Bools, Doubles
+from advsearch.scene.assets import BoolArray, Float64Array
 from scenes.places import paint
 from scenes.places.quads import FRONT, SHOWN, SIDES, TOP, Quads, Wall
 
@@ -66,7 +66,7 @@ class Fronts:
         color = int(rng.choice([paint.WHITE, paint.WHITE, paint.DARK, paint.GREEN]))
         sign = int(rng.integers(paint.RED, len(paint.TRIMS)))
         cells: list[tuple[float, ...]] = []
-        openings: list[Doubles] = []
+        openings: list[Float64Array] = []
         for floor in range(floors):
             low = 0.0 if floor == 0 else paint.GROUND_FLOOR + paint.FLOOR * (floor - 1)
             top = low + (
@@ -144,7 +144,12 @@ class Fronts:
         self._roof(frame, at, end, high, kind, rng)
 
     def _masonry(
-        self, frame: Wall, cells: Doubles, holes: Doubles, deep: Doubles, kind: int
+        self,
+        frame: Wall,
+        cells: Float64Array,
+        holes: Float64Array,
+        deep: Float64Array,
+        kind: int,
     ) -> None:
         left, right, low, high = cells.T
         in_left, in_right, in_low, in_high = holes.T
@@ -190,9 +195,9 @@ class Fronts:
     def _windows(
         self,
         frame: Wall,
-        holes: Doubles,
-        deep: Doubles,
-        shop: Bools,
+        holes: Float64Array,
+        deep: Float64Array,
+        shop: BoolArray,
         color: int,
         rng: np.random.Generator,
     ) -> None:
@@ -232,7 +237,7 @@ class Fronts:
         ]
         self._trim(frame, np.concatenate(rows), color, faces=(FRONT,))
 
-    def _door(self, frame: Wall, hole: Doubles, color: int, trim: int) -> None:
+    def _door(self, frame: Wall, hole: Float64Array, color: int, trim: int) -> None:
         left, right, low, high = hole
         back = 0.01 - SHOP_REVEAL
         boxes = [(left, right, back - 0.05, back, low, high)]
@@ -313,7 +318,7 @@ class Fronts:
             self._trim(frame, np.array([chimney]), paint.RED, (FRONT, SIDES, TOP))
 
     def _trim(
-        self, frame: Wall, rows: Doubles, kind: int, faces: tuple[str, ...] = SHOWN
+        self, frame: Wall, rows: Float64Array, kind: int, faces: tuple[str, ...] = SHOWN
     ) -> None:
         low, high = paint.trim_rows(kind, rows[:, 5] - rows[:, 4])
         self.walls.boxes(

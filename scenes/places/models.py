@@ -16,9 +16,9 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from advsearch.scene.assets import Doubles, Floats, Material, Mesh
+from advsearch.scene.assets import Float32Array, Float64Array, Material, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.glb import GlbBuffer, mime_type
+from advsearch.scene.glb import GlbBuffer, find_mime_type
 from scenes.places.quads import Quads
 
 VARIANTS = "KHR_materials_variants"
@@ -44,9 +44,9 @@ class Look:
     """A material of the file."""
 
     # (h, w, 3) display-referred, row 0 at v = 1; (3,) where it is the same everywhere
-    base: Floats
+    base: Float32Array
     finish: Material
-    emission: Floats | None = None  # (h, w, 3) or (3,) linear luminance, cd/m2
+    emission: Float32Array | None = None  # (h, w, 3) or (3,) linear luminance, cd/m2
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class Node:
     """Primitives in one place; nodes of the same list share what is stored."""
 
     primitives: Sequence[Primitive]
-    pose: Doubles = field(default_factory=lambda: np.eye(4))
+    pose: Float64Array = field(default_factory=lambda: np.eye(4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,9 @@ def glb(model: PlaceModel) -> bytes:
         used.add(VARIANTS)
     if used:
         header["extensionsUsed"] = sorted(used)
-    return buffer.file({name: value for name, value in header.items() if value != []})
+    return buffer.to_bytes(
+        {name: value for name, value in header.items() if value != []}
+    )
 
 
 def _primitive(
@@ -161,13 +163,13 @@ def _primitive(
     indices = mesh.faces.reshape(-1).astype(np.uint16 if is_small else np.uint32)
     written: dict[str, Any] = {
         "attributes": {
-            "POSITION": buffer.accessor(_y_up(mesh.vertices), "VEC3", bounds=True),
-            "NORMAL": buffer.accessor(_y_up(mesh.normals), "VEC3"),
-            "TEXCOORD_0": buffer.accessor(
+            "POSITION": buffer.add_accessor(_y_up(mesh.vertices), "VEC3", bounds=True),
+            "NORMAL": buffer.add_accessor(_y_up(mesh.normals), "VEC3"),
+            "TEXCOORD_0": buffer.add_accessor(
                 np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1), "VEC2"
             ),
         },
-        "indices": buffer.accessor(indices, "SCALAR"),
+        "indices": buffer.add_accessor(indices, "SCALAR"),
         "material": names.index(primitive.look),
     }
     if primitive.variants:
@@ -179,7 +181,7 @@ def _primitive(
     return written
 
 
-def _y_up(vectors: Floats) -> Floats:
+def _y_up(vectors: Float32Array) -> Float32Array:
     return np.ascontiguousarray(vectors[:, [1, 2, 0]], np.float32)
 
 
@@ -220,19 +222,21 @@ def _material(
 
 
 def _texture(
-    header: dict[str, Any], buffer: GlbBuffer, display: Floats
+    header: dict[str, Any], buffer: GlbBuffer, display: Float32Array
 ) -> dict[str, int]:
     picture = _png(display)
-    view = buffer.view(picture)
+    view = buffer.add_view(picture)
     views = [image["bufferView"] for image in header["images"]]
     if view not in views:
         views.append(view)
-        header["images"].append({"mimeType": mime_type(picture), "bufferView": view})
+        header["images"].append(
+            {"mimeType": find_mime_type(picture), "bufferView": view}
+        )
         header["textures"].append({"source": len(views) - 1, "sampler": 0})
     return {"index": views.index(view)}
 
 
-def _png(display: Floats) -> bytes:
+def _png(display: Float32Array) -> bytes:
     levels = np.clip(np.round(display.astype(np.float64) * 255.0), 0, 255).astype(
         np.uint8
     )

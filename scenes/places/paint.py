@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles, Floats
+from advsearch.scene.assets import Float32Array, Float64Array
 from scenes.places.road import WETNESS, reflectance
 
 Color = tuple[float, float, float]
@@ -42,12 +42,14 @@ STONE, WHITE, DARK, GREEN, RED, BLUE, GREY = range(7)
 HEIGHT = HIGHEST * len(WALLS) + TRIM * len(TRIMS) + TILES
 
 
-def wall_row(kind: int, height: Doubles) -> Doubles:
+def wall_row(kind: int, height: Float64Array) -> Float64Array:
     """Return the texture's v at a height of a kind of front."""
     return np.asarray((HIGHEST * kind + height) / HEIGHT)
 
 
-def trim_rows(kind: Doubles | int, high: Doubles | float) -> tuple[Doubles, Doubles]:
+def trim_rows(
+    kind: Float64Array | int, high: Float64Array | float
+) -> tuple[Float64Array, Float64Array]:
     """Return v of the lower and the upper edge of something of a trim's colour that is
     so high.
     """
@@ -61,12 +63,12 @@ def tile_rows(high: float) -> tuple[float, float]:
     return low / HEIGHT, (low + min(high, TILES - 0.1)) / HEIGHT
 
 
-def tint(color: Color | Doubles) -> Floats:
+def tint(color: Color | Float64Array) -> Float32Array:
     return np.asarray(color, np.float32)
 
 
 @lru_cache(maxsize=1)
-def walls() -> Floats:
+def walls() -> Float32Array:
     """Paint fronts, trims and roofs: (h, w, 3) linear reflectance, row 0 at v = 1."""
     strips = [_front(*wall, seed) for seed, wall in enumerate(WALLS)]
     rows = round(TRIM / TEXEL)
@@ -87,7 +89,7 @@ def walls() -> Floats:
     return np.clip(np.concatenate(strips), 0.005, 0.9)[::-1]
 
 
-def _front(laid: str, upper: Color, lower: Color, seed: int) -> Floats:
+def _front(laid: str, upper: Color, lower: Color, seed: int) -> Float32Array:
     """One kind of front, row 0 below."""
     rows = round(HIGHEST / TEXEL)
     x, z = _places(rows, COLUMNS)
@@ -127,8 +129,8 @@ def _front(laid: str, upper: Color, lower: Color, seed: int) -> Floats:
 
 
 def _courses(
-    x: Floats, z: Floats, long: float, high: float, joint: float, seed: int
-) -> tuple[Doubles, Floats]:
+    x: Float32Array, z: Float32Array, long: float, high: float, joint: float, seed: int
+) -> tuple[Float64Array, Float32Array]:
     """Where the joints of stones are, each course half a stone on, and a number from -1
     to 1 for each stone.
     """
@@ -148,7 +150,7 @@ PANES = 8  # kinds of panes, side by side: four of dwellings and four of shops
 
 
 @lru_cache(maxsize=1)
-def panes() -> Floats:
+def panes() -> Float32Array:
     """Paint what is behind the glass: (h, w, 3) linear reflectance, row 0 at v = 1; a
     pane is 1 wide and high.
     """
@@ -212,7 +214,7 @@ FRONTS = (-12.0, 15.6)  # y of the fronts of the houses on the right and on the 
 
 
 @lru_cache(maxsize=3)
-def road(wet: bool, snow: bool = False) -> Floats:
+def road(wet: bool, snow: bool = False) -> Float32Array:
     """Paint one period of the street's ground, (h, w, 3) linear reflectance, row 0 on
     the left.
     """
@@ -282,7 +284,9 @@ def road(wet: bool, snow: bool = False) -> Floats:
     )
 
 
-def _snowed(color: Floats, y: Floats, cloud: Floats, fine: Floats) -> Floats:
+def _snowed(
+    color: Float32Array, y: Float32Array, cloud: Float32Array, fine: Float32Array
+) -> Float32Array:
     """Snow on wet ground: wheels have left two tracks in each lane, grey slush lies
     between them.
     """
@@ -297,7 +301,7 @@ def _snowed(color: Floats, y: Floats, cloud: Floats, fine: Floats) -> Floats:
     return np.asarray(snow + 0.85 * wheels[..., None] * (color - snow), np.float32)
 
 
-def _places(rows: int, columns: int) -> tuple[Floats, Floats]:
+def _places(rows: int, columns: int) -> tuple[Float32Array, Float32Array]:
     """Along and up of the middles of texels (rows, columns), row 0 below."""
     x = (np.arange(columns, dtype=np.float32) + 0.5) * TEXEL
     z = (np.arange(rows, dtype=np.float32) + 0.5) * TEXEL
@@ -306,7 +310,7 @@ def _places(rows: int, columns: int) -> tuple[Floats, Floats]:
     )
 
 
-def _grain(rows: int, columns: int, seed: int) -> Floats:
+def _grain(rows: int, columns: int, seed: int) -> Float32Array:
     """Noise of one texel, about 0, from -1 to 1."""
     return (
         np.random.Generator(np.random.PCG64(seed)).random((rows, columns), np.float32)
@@ -315,7 +319,7 @@ def _grain(rows: int, columns: int, seed: int) -> Floats:
     )
 
 
-def _clouds(rows: int, columns: int, cell: int, seed: int) -> Floats:
+def _clouds(rows: int, columns: int, cell: int, seed: int) -> Float32Array:
     """Smooth noise of some octaves from `cell` texels down, periodic along rows, about
     -1 to 1.
     """

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from advsearch.scene.assets import Bools, Doubles, Mesh
+from advsearch.scene.assets import BoolArray, Float64Array, Mesh
 
 FRONT = "front"
 SIDES = "sides"
@@ -28,7 +28,9 @@ class Wall:
     origin: tuple[float, float, float]
     out: tuple[float, float, float]
 
-    def world(self, along: Doubles, out: Doubles, up: Doubles) -> Doubles:
+    def world(
+        self, along: Float64Array, out: Float64Array, up: Float64Array
+    ) -> Float64Array:
         """Return places (..., 3) from coordinates of the wall; seen from outside,
         `along` runs to the right.
         """
@@ -47,12 +49,15 @@ class Wall:
 class Quads:
     """Quadrilaterals, counter-clockwise seen from outside, with texture coordinates."""
 
-    corners: list[Doubles] = field(default_factory=list)
-    uvs: list[Doubles] = field(default_factory=list)
-    normals: list[Doubles] = field(default_factory=list)
+    corners: list[Float64Array] = field(default_factory=list)
+    uvs: list[Float64Array] = field(default_factory=list)
+    normals: list[Float64Array] = field(default_factory=list)
 
     def add(
-        self, corners: Doubles, uvs: Doubles, normals: Doubles | None = None
+        self,
+        corners: Float64Array,
+        uvs: Float64Array,
+        normals: Float64Array | None = None,
     ) -> None:
         """Add (N, 4, 3) corners with (N, 4, 2) texture coordinates and, unless they are
         flat, (N, 4, 3) normals.
@@ -64,10 +69,10 @@ class Quads:
     def at(
         self,
         frame: Wall,
-        along: Doubles,
-        out: Doubles,
-        up: Doubles,
-        uvs: Doubles,
+        along: Float64Array,
+        out: Float64Array,
+        up: Float64Array,
+        uvs: Float64Array,
         turn: int = 1,
     ) -> None:
         """Add quadrilaterals by a wall's coordinates (N, 4), in the other order where
@@ -80,7 +85,7 @@ class Quads:
         x: tuple[float, float],
         y: tuple[float, float],
         z: float,
-        uvs: Doubles,
+        uvs: Float64Array,
         up: int = 1,
     ) -> None:
         """Add a level rectangle, which faces up, or down where `up` is -1; texture
@@ -92,7 +97,11 @@ class Quads:
         self.add(corners[:, ::up], uvs[None, ::up])
 
     def wall(
-        self, frame: Wall, rows: Doubles, out: Doubles | float, uvs: Doubles
+        self,
+        frame: Wall,
+        rows: Float64Array,
+        out: Float64Array | float,
+        uvs: Float64Array,
     ) -> None:
         """Add upright rectangles (N, 4) at a wall: left, right, low and high, so far
         out of it (N,), with texture coordinates (N, 4) of the same order.
@@ -101,7 +110,11 @@ class Quads:
         self.at(frame, along, np.reshape(out, (-1, 1)), up, _around(uvs))
 
     def boxes(
-        self, frame: Wall, rows: Doubles, uvs: Doubles, faces: Sequence[str] = SHOWN
+        self,
+        frame: Wall,
+        rows: Float64Array,
+        uvs: Float64Array,
+        faces: Sequence[str] = SHOWN,
     ) -> None:
         """Add boxes (N, 6) at a wall: left, right, back, front, low, high, with texture
         coordinates (N, 4) as of `wall` for the front, of which the other faces show a
@@ -132,7 +145,7 @@ class Quads:
             across = np.cross(
                 corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
             )
-            shaded: Bools = np.asarray(normals.any(axis=(1, 2)))
+            shaded: BoolArray = np.asarray(normals.any(axis=(1, 2)))
             faced = np.where(shaded[:, None], normals.mean(axis=1), across)
             lies = faced[:, 2] > SLOPE * np.linalg.norm(faced, axis=1)
             bare.add(corners[~lies], uvs[~lies], normals[~lies])
@@ -162,7 +175,7 @@ class Quads:
         )
 
 
-def _around(uvs: Doubles) -> Doubles:
+def _around(uvs: Float64Array) -> Float64Array:
     """(N, 4, 2) the corners of rectangles (N, 4) of texture coordinates: left, right,
     low, high.
     """

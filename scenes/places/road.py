@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from advsearch.scene.assets import Doubles, Floats, Material, Mesh
+from advsearch.scene.assets import Float32Array, Float64Array, Material, Mesh
 from advsearch.scene.color import linear_to_srgb
 from scenes.places.models import Look, Node, PlaceModel, Primitive
 
@@ -34,7 +34,9 @@ Materials: about a half).
 """
 
 
-def reflectance(x: Doubles, y: Doubles, grain: Doubles | None = None) -> Doubles:
+def reflectance(
+    x: Float64Array, y: Float64Array, grain: Float64Array | None = None
+) -> Float64Array:
     """Return the linear reflectance (N, 3) of the ground at x along the road and y
     across; `grain` makes it uneven.
     """
@@ -58,7 +60,7 @@ def reflectance(x: Doubles, y: Doubles, grain: Doubles | None = None) -> Doubles
     kerb = (0.38 * (1.0 + 0.3 * grain))[:, None] * np.where(
         (x % 1.0 < 0.02)[:, None], 0.6, np.ones(3)
     )
-    shade: Doubles = np.where(
+    shade: Float64Array = np.where(
         (off > 0.0)[:, None], np.where((off > 0.16)[:, None], slabs, kerb), color
     )
     return np.where((np.abs(off) < 0.012)[:, None], 0.05, shade)
@@ -98,7 +100,7 @@ def make_road() -> PlaceModel:
     )
 
 
-def _texture(wet: bool) -> Floats:
+def _texture(wet: bool) -> Float32Array:
     """One period of the road, (h, w, 3) display-referred, multiples of 1/255, row 0 on
     the left.
     """
@@ -119,7 +121,7 @@ def _texture(wet: bool) -> Floats:
     return shown(np.round(linear, 5).astype(np.float32))
 
 
-def shown(linear: Floats) -> Floats:
+def shown(linear: Float32Array) -> Float32Array:
     """Return linear values as display-referred multiples of 1/255."""
     return np.asarray(
         np.round(linear_to_srgb(linear) * np.float32(255.0)) / np.float32(255.0),

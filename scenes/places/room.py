@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles, Floats, Material
+from advsearch.scene.assets import Float32Array, Float64Array, Material
 from scenes.places.models import Look, Node, PlaceModel, make_primitive
 from scenes.places.paint import _clouds, _grain, tint
 from scenes.places.quads import FRONT, SHOWN, Quads, Wall
@@ -106,7 +106,7 @@ def make_room() -> PlaceModel:
     return PlaceModel(looks, nodes, file)
 
 
-def _texture() -> Floats:
+def _texture() -> Float32Array:
     """All strips, row 0 at v = 1: (h, w, 3) display-referred multiples of 1/255."""
     rows = round(STRIP / TEXEL)
     fine = _grain(rows * len(COLORS), COLUMNS, 700)
@@ -136,7 +136,7 @@ def _texture() -> Floats:
     return shown(np.clip(np.concatenate(strips), 0.004, 0.9).astype(np.float32)[::-1])
 
 
-def _outside() -> Floats:
+def _outside() -> Float32Array:
     """What is seen through the window, 1 for the sky, row 0 above: sky, trees and a
     lawn behind glazing bars.
     """
@@ -202,8 +202,8 @@ def _solid_furniture() -> list[dict[str, Any]]:
 
 
 def _rows(
-    strip: int, low: Doubles | float, high: Doubles | float
-) -> tuple[Doubles, Doubles]:
+    strip: int, low: Float64Array | float, high: Float64Array | float
+) -> tuple[Float64Array, Float64Array]:
     """v of the lower and the upper edge of something that shows a strip, which is only
     so high.
     """

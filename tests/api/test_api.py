@@ -355,7 +355,7 @@ def test_auto_takes_half_of_the_samples_and_looks_again_where_it_is_close(
 def test_a_search_is_as_long_as_what_is_asked_needs(asked: dict[str, Any], steps: int, draws: int) -> None:
     config = AttackConfig(object="mug", resolution=8, threads=1, **asked)
     problem, _ = problem_from_config(config)
-    assert (problem.steps, problem.draws) == (steps, draws)
+    assert (problem.steps, problem.n_draws) == (steps, draws)
 
 
 @pytest.mark.medium

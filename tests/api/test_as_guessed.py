@@ -22,8 +22,8 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.controls import CONTROLS, LightControl, PoseControl
-from advsearch.engine.loading import as_controls, instances_in, settings_of
-from advsearch.engine.naming import given_to
+from advsearch.engine.loading import controls_to_settings, list_control_instances, make_controls
+from advsearch.engine.naming import make_configured_controls
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.progress import BarProgress, LineProgress, NotebookProgress, NullProgress, watched
 from advsearch.questions.attack.result import AttackResult
@@ -197,7 +197,7 @@ def test_a_result_is_replayed_with_the_network_of_the_session(attacked: AttackRe
 def test_a_found_texture_is_put_on_another_scene(attacked: AttackResult, tmp_path: Path) -> None:
     texture = attacked.artifacts["texture"]
     painted = advsearch.load_scene("mug", "noon", texture=texture)
-    assert painted.only_here and np.array_equal(painted.description.object.base_color, texture.numpy())
+    assert painted.is_session_only and np.array_equal(painted.description.object.base_color, texture.numpy())
     drawn = advsearch.render("mug", Bright(), texture=texture, resolution=SIDE, spp=4, denoise="none")
     plain = advsearch.render("mug", Bright(), resolution=SIDE, spp=4, denoise="none")
     assert not torch.equal(drawn.views[0].picture, plain.views[0].picture)
@@ -274,17 +274,17 @@ def _other() -> Callable[..., float]:
 
 @pytest.mark.medium
 def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Model) -> None:
-    from advsearch.engine.judging import metrics_as_settings, only_here
-    from advsearch.questions.sweep.carry_out import job_of, sweep_worker
+    from advsearch.engine.judging import list_session_only_metrics, metrics_to_settings
+    from advsearch.questions.sweep.carry_out import load_job, sweep_worker
     from advsearch.questions.sweep.settings import SweepConfig
 
-    named = metrics_as_settings({"red": red, "own": lambda image, output, truth: 0.0})
+    named = metrics_to_settings({"red": red, "own": lambda image, output, truth: 0.0})
     assert named == {"red": f"{__name__}:red", "own": "<lambda>"}
-    assert only_here(named) == ["own"]
+    assert list_session_only_metrics(named) == ["own"]
     config = SweepConfig(object="mug", grid={"pose.yaw": [0, 90]}, metrics={"red": "math:hypot"}, **PICTURE)
     advsearch.allow_code("math:hypot")  # as the coordinator sends it along
     with pytest.raises(ValueError, match="only one element tensors"):  # a worker has math.hypot from its name
-        sweep_worker(config.plain())(job_of(config).queries(range(1)))
+        sweep_worker(config.to_json())(load_job(config).make_queries(range(1)))
     refused: list[tuple[Any, str]] = [
         ({"f": 3}, "f: expected a function"),
         ({"f": lambda image, output: 0.0}, r"f: expected a function of \(image, output, truth\): too many"),
@@ -369,10 +369,14 @@ def test_a_mapping_may_have_instances(scene: advsearch.Scene) -> None:
     """In the order in which they are given, which is that of a file."""
     given: dict[str, Any] = {"pose.yaw": {}, "light": LightControl(), "camera": None}
     for controls in (given, ["pose.yaw", given["light"], "camera"]):
-        made = as_controls(controls)
+        made = make_controls(controls)
         assert [one.name for one in made] == ["pose", "light", "camera"] and made[1] is given["light"]
-        assert list(settings_of(controls)) == [*given] and instances_in(controls) == [made[1]]
-        assert [one.name for one in given_to(AttackConfig(object="mug"), controls)] == ["pose", "light", "camera"]
+        assert list(controls_to_settings(controls)) == [*given] and list_control_instances(controls) == [made[1]]
+        assert [one.name for one in make_configured_controls(AttackConfig(object="mug"), controls)] == [
+            "pose",
+            "light",
+            "camera",
+        ]
     refused: list[tuple[Any, str]] = [
         (
             {"mine": LightControl()},

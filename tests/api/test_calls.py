@@ -16,7 +16,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch import losses
 from advsearch.attacks import get_objective
-from advsearch.calls import OTHER_TERMS, check_types, unexpected
+from advsearch.calls import OTHER_TERMS, check_types, make_unexpected_error
 from advsearch.controls import NumberControl, Parameter, compose
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
@@ -60,7 +60,7 @@ def test_every_function_says_which_keywords_it_has_not(name: str) -> None:
 def test_every_other_term_leads_to_a_keyword_of_some_function() -> None:
     known = {key for name in FUNCTIONS for key in inspect.signature(getattr(advsearch, name)).parameters}
     assert set(OTHER_TERMS.values()) <= known
-    assert unexpected("f", {"a": 1}, ["a"]) is None
+    assert make_unexpected_error("f", {"a": 1}, ["a"]) is None
 
 
 @pytest.mark.parametrize("name", [name for name in FUNCTIONS if name != "load_run"])
@@ -110,9 +110,9 @@ def test_types_that_are_told() -> None:
 )
 def test_a_loss_of_torch_that_leads_away_from_the_target_is_refused(loss: Any) -> None:
     with pytest.raises(InputError, match=r"objective: it is maximised, and torch's \w+ falls towards the `target`"):
-        losses.check_aim(loss, targeted=True)
-    losses.check_aim(loss, targeted=False)
-    losses.check_aim(lambda logits, labels: -loss(logits, labels), targeted=True)
+        losses.check_direction(loss, targeted=True)
+    losses.check_direction(loss, targeted=False)
+    losses.check_direction(lambda logits, labels: -loss(logits, labels), targeted=True)
 
 
 def test_a_loss_of_ones_own_that_leads_away_from_the_target_warns_once() -> None:

@@ -12,7 +12,7 @@ from PIL import Image
 
 import advsearch
 from advsearch import losses
-from advsearch.api.chart import COLOURS, chart_page
+from advsearch.api.chart import CHART_COLORS, draw_chart_page
 from advsearch.errors import FileFormatError, InputError
 from advsearch.report.sheets import PAPERS
 
@@ -28,7 +28,7 @@ def printed(levels: Levels) -> Levels:
 def photographed(path: Path, *, lamp: tuple[float, float, float], slope: float, slant: float) -> Path:
     """The page, printed on paper that is white, under a lamp of some colour that is brighter on one side, seen aslant
     on a grey table."""
-    canvas = FigureCanvasAgg(chart_page("t", PAPERS["a4"], None))
+    canvas = FigureCanvasAgg(draw_chart_page("t", PAPERS["a4"], None))
     canvas.figure.set_dpi(110.0)
     canvas.draw()  # type: ignore[no-untyped-call]
     page = np.asarray(canvas.buffer_rgba())[..., :3] / 255.0  # type: ignore[no-untyped-call]
@@ -65,10 +65,10 @@ def test_what_was_printed_comes_back(
 ) -> None:
     photograph = photographed(tmp_path / "chart.jpg", lamp=lamp, slope=slope, slant=slant)
     palette = advsearch.measured_palette(photograph)
-    off = np.abs(palette.numpy() - printed(COLOURS)).max(axis=1)
+    off = np.abs(palette.numpy() - printed(CHART_COLORS)).max(axis=1)
     assert palette.shape == (125, 3) and np.median(off) < 0.01 and off.max() < 0.04
     assert torch.allclose(losses.non_printability(palette.reshape(1, 25, 5, 3), palette), torch.zeros(1), atol=1e-6)
-    assert float(losses.non_printability(torch.tensor(COLOURS).float().reshape(1, 25, 5, 3), palette)[0]) > 0.05
+    assert float(losses.non_printability(torch.tensor(CHART_COLORS).float().reshape(1, 25, 5, 3), palette)[0]) > 0.05
 
 
 def test_a_picture_without_the_chart_is_refused(tmp_path: Path) -> None:

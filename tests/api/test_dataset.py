@@ -17,7 +17,7 @@ import torch
 import advsearch
 from advsearch.cli.exporters.dataset.files import find_runs
 from advsearch.cli.main import main
-from advsearch.questions.attack.carry_out import parts_in, problem_of_parts
+from advsearch.questions.attack.carry_out import load_parts_of_run, make_problem_with_warnings
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.files import read_png
@@ -144,7 +144,7 @@ def test_an_attack_has_its_adversarial_scene_and_the_clean_scene(tmp_path: Path)
     assert [one["file_name"] for one in found["images"]] == ["control-00.png", "verification-00.png"]
     assert [one["advsearch"]["right"] for one in found["images"]] == [True, False]
     assert found["images"][1]["advsearch"]["configuration"]["pose.yaw"]["unit"] == "degrees"
-    problem, _ = problem_of_parts(parts_in(run))
+    problem, _ = make_problem_with_warnings(load_parts_of_run(run))
     for name, u in (("control", problem.domain.start), ("verification", torch.full((6,), 0.25))):
         picture = torch.from_numpy(read_png(tmp_path / "b" / "images" / f"{name}-00.png"))
         assert torch.allclose(picture, problem.picture(u, 0, 1), atol=1e-6)

@@ -22,7 +22,7 @@ from advsearch.runs.directory import OBJECT_FILE, RunDirectory
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.parts import HazePart
 from samples import make_attacked
 
@@ -54,12 +54,12 @@ def test_stock_mitsuba_renders_the_adversarial_scene(
     assert "is there already" in capsys.readouterr().err
 
     answer = AdversarialRun.load(run)
-    renderer = answer.problem.renderer.like(denoiser="none")
+    renderer = answer.problem.renderer.copy_with(denoiser="none")
     ours, again = (renderer.radiance(answer.u, seed, 128).numpy() for seed in (0, 1))
-    mi = mitsuba()
+    mi = import_mitsuba()
     theirs = np.array(mi.render(mi.load_file(str(tmp_path / "scene.xml")), seed=2, spp=128))
     back = advsearch.load_scene(f"{tmp_path}/scene.xml#object").description
-    read = MitsubaScene(back, (32, 32)).radiance({}, 3, 128).numpy()
+    read = MitsubaScene(back, (32, 32)).render_radiance({}, 3, 128).numpy()
     noise = float(np.abs(ours - again).mean())
     assert np.abs(ours - renderer.radiance(renderer.start, 0, 128).numpy()).mean() > 5 * noise
     gain = float(notes[1].partition("curve of ")[2].partition(" ")[0])
@@ -92,7 +92,7 @@ def test_stock_mitsuba_renders_haze_and_a_plain_background(
     answer = AdversarialRun.load(run)
     renderer = answer.problem.renderer
     ours, again = (renderer.radiance(answer.u, seed, 128).numpy() for seed in (0, 1))
-    mi = mitsuba()
+    mi = import_mitsuba()
     scene = mi.load_file(str(tmp_path / "scene.xml"))
     theirs, once_more = (np.array(mi.render(scene, seed=seed, spp=128)) for seed in (2, 3))
     noise = max(np.abs(ours - again).mean(), np.abs(theirs - once_more)[..., :3].mean())
@@ -100,7 +100,7 @@ def test_stock_mitsuba_renders_haze_and_a_plain_background(
         assert "Haze scatters light" in note
         back = advsearch.load_scene(f"{tmp_path}/scene.xml#object")
         (haze,) = (part for part in back.description.parts if isinstance(part, HazePart))
-        read = MitsubaScene(back.description, (16, 16)).radiance({}, 3, 128).numpy()
+        read = MitsubaScene(back.description, (16, 16)).render_radiance({}, 3, 128).numpy()
         assert not back.description.notes and np.abs(ours - read).mean() < 1.2 * noise
         assert read.mean() == pytest.approx(ours.mean(), rel=0.02)
         space = make_space([make_control("haze", {})], back.description)  # goes on from the scene's own

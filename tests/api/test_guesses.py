@@ -14,7 +14,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch import losses
 from advsearch.attacks import Random
-from advsearch.attacks.objectives import form_of
+from advsearch.attacks.objectives import read_signature
 from advsearch.cli.main import main
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import FileFormatError, InputError
@@ -83,12 +83,12 @@ def wrong(output: Tensor) -> Tensor:
 
 
 def test_two_parameters_are_an_output_and_labels_whatever_they_are_called() -> None:
-    assert not form_of(lambda x, y: x).images and form_of(lambda x, z, y: x).images
-    assert form_of(lambda *given: given[0]).images
+    assert not read_signature(lambda x, y: x).images and read_signature(lambda x, z, y: x).images
+    assert read_signature(lambda *given: given[0]).images
     functions: list[Any] = [lambda logits, images: logits, lambda logits, texture: logits]
     for one in functions:
         with pytest.raises(InputError, match=r"takes \(output, images, truth\) or \(output, labels\)"):
-            form_of(one)
+            read_signature(one)
 
 
 def test_a_loss_that_leads_the_wrong_way_is_refused(scene: advsearch.Scene) -> None:

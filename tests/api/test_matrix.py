@@ -14,7 +14,7 @@ from torch import Tensor
 import advsearch
 from advsearch.attacks import get_objective
 from advsearch.cli.main import main
-from advsearch.engine.judging import of_ensemble
+from advsearch.engine.judging import reduce_objectives
 from advsearch.engine.verifier import Retrials
 from advsearch.errors import InputError
 from advsearch.questions.attack import attack
@@ -26,7 +26,7 @@ from advsearch.questions.region.result import RegionConfig
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.tasks import Classification
-from advsearch.tasks.together import Together, of_each, together
+from advsearch.tasks.together import EnsembleTask, join_models, split_by_model
 from small_models import easy, hard
 from stand_ins import rows, shared
 
@@ -106,7 +106,7 @@ def test_workers_make_the_pictures_of_the_trials(
     """Of three configurations six for each model, whose input sizes differ; the rows stay."""
     run = tmp_path / "run"
     config = AttackConfig(**{**SHORT, "model": BOTH, "run": str(run)})
-    ready = shared(monkeypatch, config.plain(), models_worker)
+    ready = shared(monkeypatch, config.to_json(), models_worker)
     monkeypatch.setattr(parts, "open_workers", lambda work, **_: nullcontext(None))
     result = carried_out(run, workers=2)
     assert isinstance(result, MatrixResult) and len(ready.given) == 3 * 2 * 6
@@ -171,9 +171,9 @@ def test_models_that_do_not_fit_are_refused_in_words(tmp_path: Path, more: dict[
 def test_an_ensemble_answers_as_its_models_do() -> None:
     models = easy(), hard()
     pictures = torch.rand((3, 32, 32, 3), generator=torch.Generator().manual_seed(0))
-    both = together(models)
+    both = join_models(models)
     assert both.input_size == (32, 32) and both.differentiable and len(both(pictures)) == 3
-    for own, output in zip(models, of_each(both(pictures)), strict=True):
+    for own, output in zip(models, split_by_model(both(pictures)), strict=True):
         assert torch.equal(output, own(pictures))
 
 
@@ -181,7 +181,7 @@ def test_an_ensemble_answers_as_its_models_do() -> None:
 def test_objectives_are_put_together(way: Any, value: float, slopes: tuple[float, float]) -> None:
     """Margins of 2 and 1; a gradient goes to both, or to the least."""
     first, second = torch.tensor([[0.0, 2.0]], requires_grad=True), torch.tensor([[1.0, 0.0]], requires_grad=True)
-    objective = of_ensemble([get_objective("margin", Classification())] * 2, way)
+    objective = reduce_objectives([get_objective("margin", Classification())] * 2, way)
     found: Tensor = objective([(first, second)], torch.zeros(1, 2, 2, 3), ((0,), (1,)))
     assert found.tolist() == [value]
     found.sum().backward()
@@ -201,7 +201,7 @@ def test_objectives_are_put_together(way: Any, value: float, slopes: tuple[float
 def test_a_prediction_counts_where_it_does_for_each_model(logits: list[list[float]], score: float, right: bool) -> None:
     """One model that errs is neither a success nor a right answer."""
     tasks = (Classification(labels=("mug", "vase")), Classification(labels=("cup", "jar")))
-    task = Together(parts=tasks, models=(easy(), hard()), tasks=tasks)
+    task = EnsembleTask(parts=tasks, models=(easy(), hard()), tasks=tasks)
     output = [tuple(torch.tensor([one]) for one in logits)]
     (judged,) = task.judge(output, ((0,), (0,)))
     assert (judged.score, judged.right, judged.success) == (score, right, score > 0.0)

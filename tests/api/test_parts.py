@@ -14,7 +14,7 @@ from advsearch.errors import ClusterError
 from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack import studies as parts
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.studies import chains_of, curve
+from advsearch.questions.attack.studies import curve, make_chains
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import read_configuration
 
@@ -71,7 +71,7 @@ def test_a_shared_study_is_the_one_that_was_made_here(tmp_path: Path, monkeypatc
         (row.object, row.ending, row.margin, row.average) for row in alone.table
     ]
     assert [row.average and row.average.configurations for row in shared.table] == [6, 6]
-    for name in (part.name for (part,) in chains_of(SMALL)):
+    for name in (part.name for (part,) in make_chains(SMALL)):
         here, there = (tmp_path / one / "parts" / name for one in ("alone", "shared"))
         assert rows(there) == rows(here) and (read_configuration(there) == read_configuration(here)).all()
         assert {one.name for one in there.iterdir()} >= {"run.yaml", "summary.json", "report.html", "images"}
@@ -88,7 +88,7 @@ def test_an_attack_of_which_every_worker_dies_ends_the_study_by_its_name(
 
 
 def test_a_study_is_an_attack_for_every_object() -> None:
-    found = [part for (part,) in chains_of(SMALL.model_copy(update={"workers": 2}))]
+    found = [part for (part,) in make_chains(SMALL.model_copy(update={"workers": 2}))]
     assert [part.name for part in found] == ["00-mug", "01-bowl"]
     assert all(part.config.run is None and part.config.workers is None for part in found)
     assert [part.config.average for part in found] == [6, 6]
@@ -98,7 +98,7 @@ def test_a_study_is_an_attack_for_every_object() -> None:
 def test_a_shared_curve_tries_no_epsilon_more_than_one_that_was_made_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    small = AttackConfig.of(
+    small = AttackConfig.from_config(
         SMALL, object="mug", controls={"texture": {"resolution": 2}}, epsilon="0.02,0.01", average=0
     )
     alone = run_and_save(curve, RunContext(small.model_copy(update={"run": str(tmp_path / "alone")})))
@@ -111,12 +111,12 @@ def test_a_shared_curve_tries_no_epsilon_more_than_one_that_was_made_here(
 
 
 def test_a_curve_is_a_chain_for_each_object_and_a_matrix_one_attack_for_each_model() -> None:
-    curve = chains_of(AttackConfig(object="mug,bowl", epsilon="0.2,0.1", workers=2))
-    assert [[(one.of, one.epsilon) for one in chain] for chain in curve] == [
+    curve = make_chains(AttackConfig(object="mug,bowl", epsilon="0.2,0.1", workers=2))
+    assert [[(one.subject, one.epsilon) for one in chain] for chain in curve] == [
         [("mug", 0.1), ("mug", 0.2)],
         [("bowl", 0.1), ("bowl", 0.2)],
     ]
-    matrix = chains_of(AttackConfig(object="mug", model="a,b", workers=2))
+    matrix = make_chains(AttackConfig(object="mug", model="a,b", workers=2))
     assert [[(one.name, one.config.model) for one in chain] for chain in matrix] == [[("00-a", "a")], [("01-b", "b")]]
-    together = chains_of(AttackConfig(object="mug", model="a,b", ensemble="worst"))
+    together = make_chains(AttackConfig(object="mug", model="a,b", ensemble="worst"))
     assert [[(one.name, one.config.model) for one in chain] for chain in together] == [[("00-all", "a,b")]]

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.api import keywords as api_keywords
-from advsearch.api.keywords import hint_of
+from advsearch.api.keywords import make_hint
 from advsearch.config import CONFIGS
 from advsearch.errors import InputError
 from advsearch.models import ModelWarning
@@ -87,7 +87,7 @@ def test_typed_keywords_are_the_settings(function: Any, keywords: Any, command: 
     own = inspect.signature(function.__wrapped__).parameters
     fields, declared = CONFIGS[command].model_fields, settings(CONFIGS[command])
     optional = [one.field for one in declared if not one.required]
-    expected = {field.removesuffix("_"): hint_of(field, fields[field].annotation) for field in optional}
+    expected = {field.removesuffix("_"): make_hint(field, fields[field].annotation) for field in optional}
     names = {**vars(typing), **vars(collections.abc), **vars(api_keywords)}
     hints = get_type_hints(keywords)
     assert hints.keys() == expected.keys() - own.keys()

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.keywords import configured
+from advsearch.api.keywords import make_config
 from advsearch.attacks import make_policy
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS
@@ -28,7 +28,7 @@ from advsearch.controls import Control
 from advsearch.controls.base import NumberControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.naming import given_to, load_models, scene_of
+from advsearch.engine.naming import load_configured_scene, load_models, make_configured_controls
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
@@ -298,16 +298,18 @@ class Faded(NumberControl):
 
 def test_settings_hold_the_objects_that_they_name_and_nothing_else_does(scene: advsearch.Scene) -> None:
     model, faded = victim(0.5), Faded(amount=[0.0, 0.5])
-    config = configured(RegionConfig, object=scene, model=model, controls=[faded, "pose.yaw"])
-    assert [(part.role, part.name) for part in config.only_here] == [("model", "bright"), ("control", "Faded")]
+    config = make_config(RegionConfig, object=scene, model=model, controls=[faded, "pose.yaw"])
+    assert [(part.role, part.name) for part in config.python_only_parts] == [("model", "bright"), ("control", "Faded")]
     assert (config.object, config.model, [*config.controls]) == ("mug", "bright", ["faded", "pose.yaw"])
-    attacked = AttackConfig.of(config, seed=3)  # goes on from one experiment to another
-    assert scene_of(attacked) is scene and given_to(attacked, attacked.controls)[0] is faded
+    attacked = AttackConfig.from_config(config, seed=3)  # goes on from one experiment to another
+    assert (
+        load_configured_scene(attacked) is scene and make_configured_controls(attacked, attacked.controls)[0] is faded
+    )
     (loaded,), _ = load_models([attacked.model], make_task("classification"), attacked)
     assert loaded.module is model.module
     with pytest.raises(AdvsearchError, match="bright"):  # the name alone is not known
         load_models(["bright"], make_task("classification"), AttackConfig(object="mug", model="bright"))
-    assert scene_of(AttackConfig(object="mug")) is not scene
+    assert load_configured_scene(AttackConfig(object="mug")) is not scene
 
 
 @pytest.mark.medium

@@ -21,7 +21,7 @@ from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.experiment import RunContext, run_and_save, run_experiment
 from advsearch.questions.attack import studies
-from advsearch.questions.attack.display import claims
+from advsearch.questions.attack.display import make_attack_claims
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
 from advsearch.questions.attack.summary import AttackSummary
@@ -139,7 +139,7 @@ def test_the_average_stands_beside_the_worst_case_of_each_object(asked: list[Att
     assert [row.average and row.average.correct for row in summary.table] == [45, 45]
     text = text_of(summary)
     assert "right on average" in text and len(re.findall(r"45/50 \(90 %\) +78-97 %", text)) == 2
-    named = [claim.statement for claim in claims(summary) if "drawn by chance" in claim.statement]
+    named = [claim.statement for claim in make_attack_claims(summary) if "drawn by chance" in claim.statement]
     assert [text.partition(":")[0] for text in named] == ["mug", "bowl"]
 
 
@@ -176,7 +176,7 @@ def test_a_region_that_is_interrupted_says_how_to_go_on(
     def stopped(*_: Any, **__: Any) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(boxes, "grow", stopped)
+    monkeypatch.setattr(boxes, "grow_box", stopped)
     monkeypatch.setattr(
         growing, "find_verdict", lambda verifier, centre: next(verifier.trials("centre", {0: centre})).success
     )

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from advsearch.attacks.domain import TOLERANCE, Block, Domain, centre_of_option, project_l2_box
+from advsearch.attacks.domain import TOLERANCE, Block, Domain, option_center, project_l2_box
 from advsearch.errors import InputError
 
 QP_TOLERANCE = 2e-5  # SLSQP stops here; the projection itself is exact to float32
@@ -150,7 +150,7 @@ def test_a_discrete_choice_is_sampled_at_the_middle_of_its_options_and_has_no_up
 
 
 def test_the_last_option_ends_at_one() -> None:
-    assert centre_of_option(torch.tensor([0.0, 0.24, 0.26, 0.99, 1.0]), 4).tolist() == [
+    assert option_center(torch.tensor([0.0, 0.24, 0.26, 0.99, 1.0]), 4).tolist() == [
         0.125, 0.125, 0.375, 0.875, 0.875,
     ]  # fmt: skip
 

@@ -28,15 +28,15 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.domain import project_l2_box
-from advsearch.attacks.evaluation import one_thread
+from advsearch.attacks.evaluation import use_one_thread
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.controls.base import Parameter
-from advsearch.controls.ranges import Range, read
+from advsearch.controls.ranges import Range, parse_spec
 from advsearch.files import JsonObject
 from advsearch.models import load_model
 from advsearch.models.model import Model, Preprocessing
-from advsearch.questions.stability.scenes import condition_number, hessian
-from advsearch.scene.color import linear_to_srgb, to_8_bit
+from advsearch.questions.stability.scenes import condition_number, estimate_hessian
+from advsearch.scene.color import linear_to_srgb, round_to_8_bit
 from advsearch.tasks import Classification, Judgement, Prediction
 
 LABELS, IMAGE = (0,), torch.zeros(1, 2, 2, 3)
@@ -177,7 +177,7 @@ def test_what_a_search_claims_of_random_predictions_is_never_verified(rate: floa
         def trial(query: Query, run: int = run) -> Evaluation:
             # the picture decides, so another configuration gives another answer
             value = margin(seeds.stream(run, f"trial {query.u.tolist()}", query.seed))
-            return Evaluation.of(
+            return Evaluation.from_judgement(
                 Judgement(value, -value, value <= 0.0, Prediction("wrong" if value > 0.0 else "right"))
             )
 
@@ -253,7 +253,7 @@ def test_verdicts_in_single_and_double_precision_differ_only_on_the_boundary() -
     pictures = large.clamp(0.0, 1.0).permute(0, 2, 3, 1)
 
     def answers(images: Tensor) -> tuple[Tensor, Tensor]:
-        with torch.no_grad(), one_thread():
+        with torch.no_grad(), use_one_thread():
             x = model.preprocessing(images)
             return model.module(x), exact(x.double())
 
@@ -276,7 +276,7 @@ def test_verdicts_in_single_and_double_precision_differ_only_on_the_boundary() -
 def test_the_8_bit_picture_is_the_same_but_for_ties_and_the_model_does_not_notice() -> None:
     model = load_model("reference")
     radiance = 1.2 * torch.rand(*model.input_size, 3, generator=torch.Generator().manual_seed(1))
-    single, double = to_8_bit(linear_to_srgb(radiance)), to_8_bit(linear_to_srgb(radiance.double()))
+    single, double = round_to_8_bit(linear_to_srgb(radiance)), round_to_8_bit(linear_to_srgb(radiance.double()))
     off = ((single.double() - double) * 255.0).abs().round()
     assert float(off.max()) <= 1.0 and float((off > 0.0).double().mean()) <= 1e-4
     with torch.no_grad():
@@ -422,7 +422,9 @@ def test_policies_get_through_a_curved_valley() -> None:
     down into the valley, and no further than random search does in two dimensions."""
     start = [0.2, 0.75]
     gaps = medians(valley, start, 400, lambda result: -result.best_objective)
-    second = hessian(lambda u: float(valley(u)), torch.tensor([0.75, 0.75]).double(), torch.eye(2).double(), [1e-3] * 2)
+    second = estimate_hessian(
+        lambda u: float(valley(u)), torch.tensor([0.75, 0.75]).double(), torch.eye(2).double(), [1e-3] * 2
+    )
     assert 0.9 <= condition_number(second) / 2508.0 <= 1.1
     assert all(gaps[name] <= gaps["random"] for name in ("auto", "adam", "cmaes"))
     assert gaps["pgd"] <= -0.01 * float(valley(torch.tensor(start))) and min(gaps["auto"], gaps["cmaes"]) <= 1e-3
@@ -453,15 +455,15 @@ def lamp_and_rotation(watt: float, degree: float) -> Toy:
     """An objective of a power and an angle in other units; the ranges are read and mapped as those of any control."""
     power = Parameter("power", (), "W", 0.0, 12.0 * watt, 1.0 * watt, "")
     angle = Parameter("angle", (), "degrees", 0.0, 90.0 * degree, 10.0 * degree, "")
-    specs = [read(one.name, one, [one.low, one.high]) for one in (power, angle)]  # as --control would
+    specs = [parse_spec(one.name, one, [one.low, one.high]) for one in (power, angle)]  # as --control would
     ranges = [spec for spec in specs if isinstance(spec, Range)]
 
     def value(u: Tensor) -> Tensor:
-        watts = ranges[0].at(u[0]) / watt
-        degrees = ranges[1].at(u[1]) / degree
+        watts = ranges[0].interpolate(u[0]) / watt
+        degrees = ranges[1].interpolate(u[1]) / degree
         return -((watts - 7.3) ** 2) - 0.01 * (degrees - 33.0 - 2.0 * watts) ** 2
 
-    return Toy(value, box_domain([ranges[0].coordinate(watt), ranges[1].coordinate(10.0 * degree)]))
+    return Toy(value, box_domain([ranges[0].find_coordinate(watt), ranges[1].find_coordinate(10.0 * degree)]))
 
 
 @pytest.mark.medium

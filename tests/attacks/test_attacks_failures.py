@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from advsearch.attacks.candidates import most_different
+from advsearch.attacks.candidates import select_diverse
 
 LINE = torch.tensor([[0.0], [0.1], [0.5], [0.9]])
 NUMBER = torch.tensor([False])
@@ -12,16 +12,16 @@ YES = torch.tensor([True])
 
 
 def test_the_worst_is_first_and_then_the_farthest() -> None:
-    assert most_different(LINE, [1.0, 4.0, 2.0, 3.0], NUMBER, NUMBER) == [1, 3, 2, 0]
+    assert select_diverse(LINE, [1.0, 4.0, 2.0, 3.0], NUMBER, NUMBER) == [1, 3, 2, 0]
 
 
 def test_the_ends_of_an_angle_are_neighbours() -> None:
-    assert most_different(LINE, [4.0, 1.0, 2.0, 3.0], YES, NUMBER, most=2) == [0, 2]
+    assert select_diverse(LINE, [4.0, 1.0, 2.0, 3.0], YES, NUMBER, limit=2) == [0, 2]
 
 
 def test_options_are_equally_far_apart_and_the_worse_goes_first() -> None:
-    assert most_different(LINE, [4.0, 1.0, 2.0, 3.0], NUMBER, YES) == [0, 3, 2, 1]
+    assert select_diverse(LINE, [4.0, 1.0, 2.0, 3.0], NUMBER, YES) == [0, 3, 2, 1]
 
 
 def test_there_are_no_more_than_there_are() -> None:
-    assert most_different(torch.empty(0, 1), [], NUMBER, NUMBER) == []
+    assert select_diverse(torch.empty(0, 1), [], NUMBER, NUMBER) == []

@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from advsearch import losses
 from advsearch.attacks import OBJECTIVES, get_objective, margin, objective_functions
 from advsearch.attacks.objective_functions import (
+    MAX_LOG_ODDS,
     NEARBY,
     RELIEF,
-    SUREST,
     cross_entropy,
     dlr,
     feature_distance,
@@ -28,7 +28,7 @@ from advsearch.attacks.objective_functions import (
     targeted_log_odds,
     targeted_margin,
 )
-from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective, objective_summaries
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective, list_requested_inputs, objective_summaries
 from advsearch.engine import judging
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import load_model
@@ -90,12 +90,12 @@ def test_cross_entropy_of_huge_logits_neither_overflows_nor_cancels() -> None:
 
 
 def test_cross_entropy_goes_on_as_its_tangent_where_the_model_is_sure() -> None:
-    sure = torch.tensor([[0.0, -SUREST - 1e-3], [0.0, -SUREST + 1e-3], [0.0, 1000.0]], dtype=torch.float64)
+    sure = torch.tensor([[0.0, -MAX_LOG_ODDS - 1e-3], [0.0, -MAX_LOG_ODDS + 1e-3], [0.0, 1000.0]], dtype=torch.float64)
     values = cross_entropy(sure, sure, (1,))
-    assert float(values[0] - values[1]) == pytest.approx(2e-3 * math.exp(SUREST), rel=1e-3)  # no jump
+    assert float(values[0] - values[1]) == pytest.approx(2e-3 * math.exp(MAX_LOG_ODDS), rel=1e-3)  # no jump
     gradient = slope(cross_entropy, sure, (1,))
-    assert gradient[:, 0].tolist() == pytest.approx([math.exp(SUREST)] * 3, rel=2e-3)  # no kink, and no end
-    assert float(values[2]) == pytest.approx(-(1000 + SUREST) * math.exp(SUREST), rel=2e-3)
+    assert gradient[:, 0].tolist() == pytest.approx([math.exp(MAX_LOG_ODDS)] * 3, rel=2e-3)  # no kink, and no end
+    assert float(values[2]) == pytest.approx(-(1000 + MAX_LOG_ODDS) * math.exp(MAX_LOG_ODDS), rel=2e-3)
 
 
 #: Worked out by hand: label 0 is right, then wrong with the label second, third and last.
@@ -489,8 +489,8 @@ def test_rows_may_have_right_labels_of_their_own() -> None:
 
 def test_the_losses_of_colours_are_those_of_the_print_terms() -> None:
     colors = torch.rand(2, 5, 5, 3, generator=torch.Generator().manual_seed(0))
-    assert losses.total_variation(colors).tolist() == [float(judging.variation(one)) for one in colors]
-    assert losses.non_printability(colors).tolist() == [float(judging.off_print(one)) for one in colors]
+    assert losses.total_variation(colors).tolist() == [float(judging.mean_variation(one)) for one in colors]
+    assert losses.non_printability(colors).tolist() == [float(judging.printable_distance(one)) for one in colors]
     assert losses.total_variation(colors[0]).shape == (1,)
     ink = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
     leaf = torch.full((1, 2, 2, 3), 0.25, requires_grad=True)
@@ -510,7 +510,7 @@ def test_a_function_asks_for_more_by_name() -> None:
     def asks(logits: Tensor, images: Tensor, labels: Tensor, u: Tensor, *, configuration: Any) -> Any:
         return u[:, 0] + configuration["pose.yaw"]
 
-    assert asked_by(asks) == ("u", "configuration") and asked_by("margin") == ()
+    assert list_requested_inputs(asks) == ("u", "configuration") and list_requested_inputs("margin") == ()
     assert get_objective(asks)(LOGITS, IMAGES, (0,), more).tolist() == [11.0, 22.0]
     one_number = get_objective(lambda z, labels, u, configuration: (u[0, 0] + configuration["pose.yaw"]).sum())
     assert one_number(LOGITS, IMAGES, (0,), more).tolist() == [11.0, 22.0], "one picture at a time"
@@ -574,7 +574,7 @@ def test_the_page_says_of_every_objective_what_the_registry_says() -> None:
 
 def test_the_numbers_on_the_page_are_those_of_the_code() -> None:
     words = " ".join(PAGE.split())
-    assert f"So below {SUREST:.0f} (1 - p = {math.exp(SUREST):.0e}".replace("e-07", "e-7") in words
+    assert f"So below {MAX_LOG_ODDS:.0f} (1 - p = {math.exp(MAX_LOG_ODDS):.0e}".replace("e-07", "e-7") in words
     assert {1e-4: "A ten-thousandth of the distance"}[RELIEF] in words
     assert {1e-3: "within a thousandth of the clean length"}[NEARBY] in words
     assert f"under {math.log(2.0**-149):.0f}" in words  # the smallest float32

@@ -18,7 +18,7 @@ def trials(values: list[tuple[float, bool]]) -> list[Judgement]:
 
 def run(rule: Rule, clean: list[tuple[float, bool]], found: list[tuple[float, bool]]) -> tuple[Ending, int, int]:
     result = verify(
-        lambda queries: [Evaluation.of(trials(found)[one.number]) for one in queries],
+        lambda queries: [Evaluation.from_judgement(trials(found)[one.number]) for one in queries],
         DOMAIN,
         DOMAIN.start,
         claim=Ending.BUDGET_SPENT,
@@ -28,7 +28,7 @@ def run(rule: Rule, clean: list[tuple[float, bool]], found: list[tuple[float, bo
         clean=trials(clean),
         rule=rule,
     )
-    return result.ending, result.adversarial.successes, result.adversarial.trials
+    return result.ending, result.adversarial_counts.successes, result.adversarial_counts.trials
 
 
 def test_over_conditions_those_count_in_which_the_clean_scene_is_right() -> None:
@@ -55,7 +55,7 @@ def test_easier_means_right_and_surer_than_the_clean_scene() -> None:
 
 
 def test_no_trial_is_no_proof() -> None:
-    assert OVER_CONDITIONS.verdict(Ending.BUDGET_SPENT, Trials(10, 20, 1), Trials(0, 1, 1)) is Ending.BUDGET_SPENT
+    assert OVER_CONDITIONS.decide_ending(Ending.BUDGET_SPENT, Trials(10, 20, 1), Trials(0, 1, 1)) is Ending.BUDGET_SPENT
 
 
 @pytest.mark.parametrize(
@@ -64,4 +64,4 @@ def test_no_trial_is_no_proof() -> None:
 def test_trials_of_one_configuration_decide_unless_they_depend_on_the_noise(
     successes: int, decided: bool | None
 ) -> None:
-    assert WORST_CASE.decided(successes, 20) is decided
+    assert WORST_CASE.decide(successes, 20) is decided

@@ -28,11 +28,11 @@ from advsearch.attacks import (
     Random,
     Restarts,
     StepRecord,
-    planned_renders,
+    count_planned_renders,
     search,
 )
-from advsearch.attacks.candidates import Candidate, admit, best, contenders, with_last
-from advsearch.attacks.evaluation import MOST
+from advsearch.attacks.candidates import Candidate, add_candidate, replace_worst, select_best, select_contenders
+from advsearch.attacks.evaluation import MAX_QUERIES
 from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.seeds import stream
@@ -93,7 +93,7 @@ def test_the_best_configuration_wins_and_the_budget_is_kept() -> None:
     assert result.stopped is Ending.BUDGET_SPENT
     assert [r.phase for r in result.history] == ["search"] * 3
     assert len(result.ranking) == 6  # three candidates, twice each
-    assert result.renders == len(result.history) + len(result.ranking) <= planned_renders(3)
+    assert result.renders == len(result.history) + len(result.ranking) <= count_planned_renders(3)
     assert [r.best for r in result.history] == pytest.approx([-0.1, 0.1, 0.1])
     assert result.gradients == 0
 
@@ -109,7 +109,9 @@ def test_every_evaluation_has_its_own_seed_and_ranking_shares_new_ones() -> None
     result = search(RISE, DOMAIN, Script((at(-0.1), at(0.1), at(0.0))), steps=3, seed=0, candidates=2, repeats=3)
     assert [INDEX[r.seed] for r in result.history] == [0, 1, 2]
     assert [INDEX[r.seed] for r in result.ranking] == [3, 4, 5, 3, 4, 5]
-    other = search(sampled([]), DOMAIN, Script((at(0.0),)), steps=1, seed=0, candidates=0, kind="baseline", noise=7)
+    other = search(
+        sampled([]), DOMAIN, Script((at(0.0),)), steps=1, seed=0, candidates=0, kind="baseline", render_seed=7
+    )
     assert [r.seed for r in other.history] == [stream(7, "baseline", 0)]
 
 
@@ -193,7 +195,7 @@ def test_the_budget_is_in_renders(steps: int, gradients: int, evaluations: int) 
     assert result.gradients == gradients
     assert result.history[-1].renders == steps
     assert result.renders == result.ranking[-1].renders == steps + 3 == sum(1 + 12 * (g is True) for _, g in asked)
-    assert result.renders <= planned_renders(steps, 2, 3)
+    assert result.renders <= count_planned_renders(steps, 2, 3)
     assert max(i for i, _ in asked[:evaluations]) < steps == min(i for i, _ in asked[evaluations:])
 
 
@@ -392,9 +394,9 @@ def test_what_does_not_wait_is_asked_at_once() -> None:
 
 def test_a_search_at_random_asks_for_all_that_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = Asked()
-    search(asked, DOMAIN, Random(), steps=MOST + 3, seed=0, candidates=0)
-    assert asked.sizes == [MOST, 3]
-    monkeypatch.setattr("advsearch.attacks.evaluation.MOST_NUMBERS", 4 * DOMAIN.dim + 2)
+    search(asked, DOMAIN, Random(), steps=MAX_QUERIES + 3, seed=0, candidates=0)
+    assert asked.sizes == [MAX_QUERIES, 3]
+    monkeypatch.setattr("advsearch.attacks.evaluation.MAX_COORDINATES", 4 * DOMAIN.dim + 2)
     asked = Asked()
     search(asked, DOMAIN, Random(), steps=9, seed=0, candidates=0)
     assert asked.sizes == [4, 4, 1]
@@ -408,7 +410,7 @@ def test_rows_do_not_depend_on_when_answers_come(policy: Policy[Any]) -> None:
     """One by one, or a whole batch before the first of it is looked at; what `late` cuts off included."""
 
     def rows(evaluate: Evaluate, last: int) -> tuple[list[StepRecord], Tensor]:
-        found = search(evaluate, DOMAIN, policy, steps=30, seed=0, late=lambda done: done >= last)
+        found = search(evaluate, DOMAIN, policy, steps=30, seed=0, is_out_of_time=lambda done: done >= last)
         return [replace(one, seconds=0.0) for one in (*found.history, *found.ranking)], found.best_u
 
     for last in (30, 8):
@@ -419,7 +421,7 @@ def test_rows_do_not_depend_on_when_answers_come(policy: Policy[Any]) -> None:
 
 def test_what_is_too_late_is_not_made() -> None:
     asked = Asked()
-    found = search(asked, DOMAIN, Random(), steps=50, seed=0, candidates=0, late=lambda done: done >= 7)
+    found = search(asked, DOMAIN, Random(), steps=50, seed=0, candidates=0, is_out_of_time=lambda done: done >= 7)
     assert (asked.sizes, asked.made, len(found.history)) == ([50], 7, 7)
 
 
@@ -598,12 +600,12 @@ def test_impossible_budgets_are_refused(options: dict[str, float], message: str)
 def test_the_pool_holds_the_best_distinct_ones_and_puts_success_first() -> None:
     pool: tuple[Candidate, ...] = ()
     for value, objective, success in ((0.0, 3.0, False), (0.1, 1.0, True), (0.00001, 4.0, False), (0.2, 0.5, False)):
-        pool = admit(pool, Candidate(at(value), objective, success), 2)
+        pool = add_candidate(pool, Candidate(at(value), objective, success), 2)
     assert [(round(float(c.u[0]) - 0.5, 5), c.objective) for c in pool] == [(0.1, 1.0), (0.00001, 4.0)]
-    assert admit(pool, Candidate(at(0.00002), 3.9, False), 2) == pool
-    again = admit(pool, Candidate(at(0.00001), 9.0, True), 2)
+    assert add_candidate(pool, Candidate(at(0.00002), 3.9, False), 2) == pool
+    again = add_candidate(pool, Candidate(at(0.00001), 9.0, True), 2)
     assert again[0] is pool[0]
-    assert (again[1].objective, again[1].again, again[1].successes) == (4.0, (9.0,), 1)
+    assert (again[1].objective, again[1].repeat_objectives, again[1].successes) == (4.0, (9.0,), 1)
 
 
 def test_a_configuration_that_the_search_renders_again_has_had_new_looks() -> None:
@@ -616,31 +618,36 @@ def test_a_configuration_that_the_search_renders_again_has_had_new_looks() -> No
 
 
 def test_half_ranked_pools_fall_back_to_the_raw_order() -> None:
-    first, second = Candidate(at(0.1), 2.0, True), Candidate(at(0.0), 1.0, True, again=(9.0,), successes=1)
-    assert best((first, second)) is first
-    assert best((Candidate(at(0.1), 2.0, True, again=(-1.0,)), second)) is second
+    first, second = Candidate(at(0.1), 2.0, True), Candidate(at(0.0), 1.0, True, repeat_objectives=(9.0,), successes=1)
+    assert select_best((first, second)) is first
+    assert select_best((Candidate(at(0.1), 2.0, True, repeat_objectives=(-1.0,)), second)) is second
 
 
 # ---- looks where it is close
 
 
 def test_who_is_clearly_worse_is_out() -> None:
-    leader = Candidate(at(0.3), 2.0, False, again=(1.0, 2.0, 3.0))
-    close = Candidate(at(0.2), 1.0, False, again=(1.5, 1.0, 3.0))
-    far = Candidate(at(0.1), 1.0, False, again=(0.0, 1.1, 2.0))
-    lucky = Candidate(at(0.0), 1.0, False, again=(0.0, 1.1, 2.0), successes=3)
-    broken = Candidate(at(0.4), 1.0, False, again=(9.0, -math.inf, 9.0))
-    assert contenders((far, leader, close, broken), 3) == (leader, close)
-    assert contenders((far, leader), 1) == (far, leader), "one difference says nothing of its noise"
-    assert contenders((far, lucky), 3) == (far, lucky) and contenders((far,), 3) == (far,)
-    assert contenders((leader, replace(close, again=(9.0, *close.again))), 3)[1].again[0] == 9.0, "an older look"
+    leader = Candidate(at(0.3), 2.0, False, repeat_objectives=(1.0, 2.0, 3.0))
+    close = Candidate(at(0.2), 1.0, False, repeat_objectives=(1.5, 1.0, 3.0))
+    far = Candidate(at(0.1), 1.0, False, repeat_objectives=(0.0, 1.1, 2.0))
+    lucky = Candidate(at(0.0), 1.0, False, repeat_objectives=(0.0, 1.1, 2.0), successes=3)
+    broken = Candidate(at(0.4), 1.0, False, repeat_objectives=(9.0, -math.inf, 9.0))
+    assert select_contenders((far, leader, close, broken), 3) == (leader, close)
+    assert select_contenders((far, leader), 1) == (far, leader), "one difference says nothing of its noise"
+    assert select_contenders((far, lucky), 3) == (far, lucky) and select_contenders((far,), 3) == (far,)
+    assert (
+        select_contenders((leader, replace(close, repeat_objectives=(9.0, *close.repeat_objectives))), 3)[
+            1
+        ].repeat_objectives[0]
+        == 9.0
+    ), "an older look"
 
 
 def test_the_last_configuration_takes_the_place_of_the_worst_candidate() -> None:
     one, other, last = (Candidate(torch.tensor([value]), value, False) for value in (3.0, 2.0, 1.0))
-    assert with_last((one, other), last, 2) == (one, last) and with_last((one,), last, 2) == (one, last)
-    assert with_last((one, other), replace(last, u=other.u.clone()), 2) == (one, other)
-    assert with_last((), None, 2) == ()
+    assert replace_worst((one, other), last, 2) == (one, last) and replace_worst((one,), last, 2) == (one, last)
+    assert replace_worst((one, other), replace(last, u=other.u.clone()), 2) == (one, other)
+    assert replace_worst((), None, 2) == ()
 
 
 def test_a_clear_decision_takes_no_look_more_and_a_close_one_is_settled() -> None:
@@ -648,19 +655,19 @@ def test_a_clear_decision_takes_no_look_more_and_a_close_one_is_settled() -> Non
         noise = 0.1 * torch.randn(4, 100, generator=torch.Generator().manual_seed(seed))
         return objective_is(lambda u, index: float(u[0]) + float(noise[round(float(u[0]) * 100) % 4, index]) - 9.0)
 
-    clear = search(noisy(0), DOMAIN, Script((at(-0.2), at(0.2))), steps=2, seed=0, close=20)
+    clear = search(noisy(0), DOMAIN, Script((at(-0.2), at(0.2))), steps=2, seed=0, max_extra_repeats=20)
     assert torch.equal(clear.best_u, at(0.2)) and len(clear.ranking) < 2 * 8
     script = Script((at(0.0), at(0.05)))
     right = {
         close: sum(
-            bool(search(noisy(seed), DOMAIN, script, steps=2, seed=0, close=close).best_u[0] > 0.52)
+            bool(search(noisy(seed), DOMAIN, script, steps=2, seed=0, max_extra_repeats=close).best_u[0] > 0.52)
             for seed in range(60)
         )
         for close in (0, 20)
     }
     assert right[20] > right[0] + 3 and right[20] >= 45
-    found = search(noisy(3), DOMAIN, script, steps=2, seed=0, close=20)
-    assert found.renders <= planned_renders(2, close=20) and len({r.seed for r in found.ranking}) >= 2
+    found = search(noisy(3), DOMAIN, script, steps=2, seed=0, max_extra_repeats=20)
+    assert found.renders <= count_planned_renders(2, max_extra_repeats=20) and len({r.seed for r in found.ranking}) >= 2
 
 
 def test_the_former_name_of_a_policys_distribution_is_refused() -> None:

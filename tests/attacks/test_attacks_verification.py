@@ -29,10 +29,10 @@ from advsearch.attacks import (
     search,
     verify,
 )
-from advsearch.attacks.trials import MarginsOf, most_samples, trial_seed
+from advsearch.attacks.trials import MarginsOf, derive_trial_seed, most_samples
 from advsearch.attacks.verification import (
     EASIER,
-    LEAST_RATE,
+    MIN_RATE,
     OVER_CONDITIONS,
     OVER_LOOKS,
     TRIAL_LOOKS,
@@ -40,9 +40,9 @@ from advsearch.attacks.verification import (
     Rule,
 )
 from advsearch.errors import InputError
-from advsearch.questions.attack.settings import FEWEST_TRIALS
+from advsearch.questions.attack.settings import MIN_TRIALS
 from advsearch.questions.region.boxes import GrownBox
-from advsearch.questions.region.result import FEWEST_SAMPLES
+from advsearch.questions.region.result import MIN_SAMPLES
 from advsearch.seeds import stream
 from advsearch.statistics.paired import paired_difference
 from advsearch.tasks import Judgement, Prediction
@@ -270,7 +270,7 @@ def test_renders_of_a_sample_count_are_no_trials_and_both_groups_share_their_see
 
     choose_spp({name: record(name) for name in seen}, seed=3, ladder=(4, 8, 16))
     assert seen["a"] == seen["b"]
-    assert len(seen["a"]) == 2 and not {trial_seed(3, k) for k in range(100)} & set(sum(seen["a"], ()))
+    assert len(seen["a"]) == 2 and not {derive_trial_seed(3, k) for k in range(100)} & set(sum(seen["a"], ()))
 
 
 def test_a_nan_margin_never_settles() -> None:
@@ -293,25 +293,25 @@ def test_a_bad_ladder_is_refused(ladder: tuple[int, ...]) -> None:
 
 
 def test_nineteen_of_twenty_are_needed() -> None:
-    assert [WORST_CASE.needed(n) for n in (10, 19, 20, 21, 40, 100, 200)] == [10, 19, 19, 20, 38, 95, 190]
+    assert [WORST_CASE.count_needed(n) for n in (10, 19, 20, 21, 40, 100, 200)] == [10, 19, 19, 20, 38, 95, 190]
 
 
 @pytest.mark.parametrize("rule", [WORST_CASE, OVER_CONDITIONS, EASIER])
 def test_the_fewest_trials_are_those_whose_interval_excludes_a_claim_that_mostly_fails(rule: Rule) -> None:
-    assert rule.fewest == FEWEST_TRIALS
-    assert clopper_pearson(rule.fewest - 1, rule.fewest - 1)[0] < LEAST_RATE
-    for trials in range(rule.fewest, 300):
-        assert clopper_pearson(rule.needed(trials), trials)[0] >= LEAST_RATE
+    assert rule.min_trials == MIN_TRIALS
+    assert clopper_pearson(rule.min_trials - 1, rule.min_trials - 1)[0] < MIN_RATE
+    for trials in range(rule.min_trials, 300):
+        assert clopper_pearson(rule.count_needed(trials), trials)[0] >= MIN_RATE
 
 
 @pytest.mark.parametrize("trials", range(1, 6))
 def test_too_few_trials_find_nothing_even_if_all_succeed(trials: int) -> None:
     render = noisy(-3.0, 3.0, 0.1)
     result = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=trials)
-    assert (result.adversarial.successes, result.clean.successes) == (trials, trials)
+    assert (result.adversarial_counts.successes, result.clean_counts.successes) == (trials, trials)
     assert result.ending is Ending.NOT_VERIFIED
     assert f"A success in {trials} of {trials} trials, 6 are needed" in result.reason
-    enough = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=FEWEST_TRIALS)
+    enough = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=MIN_TRIALS)
     assert enough.ending is Ending.FOUND
 
 
@@ -326,15 +326,15 @@ def test_conditions_under_which_the_clean_scene_is_seldom_right_leave_too_few_tr
     result = verify(
         partial(map, render), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=10, rule=OVER_CONDITIONS
     )
-    assert (result.adversarial.successes, result.adversarial.trials) == (5, 5)
+    assert (result.adversarial_counts.successes, result.adversarial_counts.trials) == (5, 5)
     assert result.ending is Ending.NOT_VERIFIED
 
 
 def test_the_fewest_samples_of_a_region_follow_from_the_confidence_of_its_interval() -> None:
     low, high = torch.zeros(1), torch.ones(1)
-    for samples in (FEWEST_SAMPLES - 1, FEWEST_SAMPLES):
+    for samples in (MIN_SAMPLES - 1, MIN_SAMPLES):
         region = GrownBox(low, low, high, samples, samples, samples)
-        assert (region.interval[0] >= LEAST_RATE) == (samples == FEWEST_SAMPLES)
+        assert (region.interval[0] >= MIN_RATE) == (samples == MIN_SAMPLES)
 
 
 def test_the_interval_of_a_region_covers_although_it_is_sampled_until_nothing_differs() -> None:
@@ -373,14 +373,14 @@ def test_the_interval_of_a_region_covers_although_it_is_sampled_until_nothing_di
     ],
 )
 def test_the_verdict(search_ending: Ending, clean: int, adversarial: int, expected: Ending) -> None:
-    assert WORST_CASE.verdict(search_ending, Trials(clean, 20, 64), Trials(adversarial, 20, 64)) is expected
+    assert WORST_CASE.decide_ending(search_ending, Trials(clean, 20, 64), Trials(adversarial, 20, 64)) is expected
 
 
 def test_a_real_success_is_verified() -> None:
     result = verify(noisy(-3.0, 3.0, 0.3), DOMAIN, WORST, claim=Ending.FOUND, spp=64, seed=0)
     assert result.ending is Ending.FOUND
-    assert (result.clean.successes, result.adversarial.successes, result.renders) == (20, 20, 40)
-    assert result.adversarial.spp == 64
+    assert (result.clean_counts.successes, result.adversarial_counts.successes, result.renders) == (20, 20, 40)
+    assert result.adversarial_counts.spp == 64
     assert "A success in 20 of 20 trials, 19 are needed; clean right in 20 of 20." in result.reason
 
 
@@ -388,14 +388,14 @@ def test_a_success_counts_only_where_the_clean_one_is_right() -> None:
     """The clean margin is noise around zero: whatever the answer does, half of its trials prove nothing."""
     result = verify(noisy(-0.1, 5.0, 1.0), DOMAIN, WORST, claim=Ending.FOUND, spp=64, seed=0)
     assert all(trial.success for trial in result.adversarial_trials)
-    assert result.adversarial.successes == result.clean.successes < 19
+    assert result.adversarial_counts.successes == result.clean_counts.successes < 19
     assert result.ending in (Ending.NOT_VERIFIED, Ending.ALREADY_WRONG)
 
 
 def test_a_start_that_is_wrong_already_is_no_find() -> None:
     result = verify(noisy(2.0, 5.0, 0.1), DOMAIN, WORST, claim=Ending.FOUND, spp=64, seed=0)
     assert result.ending is Ending.ALREADY_WRONG
-    assert result.adversarial.successes == 0
+    assert result.adversarial_counts.successes == 0
     assert result.ending.explanation in result.reason
 
 
@@ -403,11 +403,11 @@ def test_a_start_that_is_wrong_already_is_no_find() -> None:
 def test_a_lucky_claim_is_not_verified(seed: int) -> None:
     """The winner's curse: nothing in the budget beats margin -1, one logit of noise makes 60 renders look otherwise."""
     render = noisy(-1.2, -1.0, 1.0)
-    claim = search(render, DOMAIN, Random(), steps=60, seed=seed, candidates=1, noise=seed)
+    claim = search(render, DOMAIN, Random(), steps=60, seed=seed, candidates=1, render_seed=seed)
     assert claim.claimed_objective > 0.2  # the raw claim: a success, 1.2 logits over anything there is
     result = verify(render, DOMAIN, claim.best_u, claim=Ending.FOUND, spp=64, seed=seed)
     assert result.ending is Ending.NOT_VERIFIED
-    assert result.adversarial.interval[1] < 0.9
+    assert result.adversarial_counts.interval[1] < 0.9
 
 
 def test_the_configuration_is_projected_again() -> None:
@@ -459,7 +459,7 @@ def test_curtailed_trials_end_with_the_verdict_of_all(rule: Rule, seed: int) -> 
     assert short.adversarial_trials == whole.adversarial_trials[: len(short.adversarial_trials)]
     assert short.renders == 20 + len(short.adversarial_trials)
     if whole.ending is Ending.FOUND:
-        assert short.adversarial == whole.adversarial, "a success is tried to the end"
+        assert short.adversarial_counts == whole.adversarial_counts, "a success is tried to the end"
 
 
 def test_a_curtailed_configuration_that_never_succeeds_is_tried_twice() -> None:
@@ -472,7 +472,11 @@ def test_a_curtailed_configuration_that_never_succeeds_is_tried_twice() -> None:
 
     found = verify(evaluate, DOMAIN, WORST, claim=Ending.BUDGET_SPENT, spp=1, seed=0, curtailed=True)
     assert made == ["control"] * 20 + ["verification"] * 2, "what nobody asks for any more is not made"
-    assert (found.adversarial.successes, found.adversarial.trials, found.ending) == (0, 2, Ending.BUDGET_SPENT)
+    assert (found.adversarial_counts.successes, found.adversarial_counts.trials, found.ending) == (
+        0,
+        2,
+        Ending.BUDGET_SPENT,
+    )
 
 
 @pytest.mark.parametrize(
@@ -490,7 +494,7 @@ def test_a_curtailed_configuration_that_never_succeeds_is_tried_twice() -> None:
 def test_trials_that_nobody_counted_end_with_the_verdict(told: str, made: tuple[int, int], ending: Ending) -> None:
     """Told are trials of the answer: successes, failures, and "-" where the clean scene is wrong."""
     found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=TRIAL_LOOKS)
-    assert (found.adversarial.successes, found.adversarial.trials) == made
+    assert (found.adversarial_counts.successes, found.adversarial_counts.trials) == made
     assert (found.ending, found.stopped) == (ending, "decided")
     clean = 23 if made[1] > 14 else 14
     assert (len(found.clean_trials), found.renders) == (clean, clean + made[1])
@@ -517,9 +521,9 @@ def test_trials_over_conditions_end_with_the_verdict(
     """As above; those count in which the clean scene is right."""
     rule = OVER_CONDITIONS
     found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=OVER_LOOKS, rule=rule)
-    assert (found.adversarial.successes, found.adversarial.trials, found.ending) == (*made, ending)
+    assert (found.adversarial_counts.successes, found.adversarial_counts.trials, found.ending) == (*made, ending)
     assert len(found.clean_trials) == clean
-    assert found.adversarial.interval[0] < clopper_pearson(*made)[0], "it allows for all looks"
+    assert found.adversarial_counts.interval[0] < clopper_pearson(*made)[0], "it allows for all looks"
 
 
 def test_a_configuration_over_conditions_goes_on_where_a_control_group_of_another_has_more_trials() -> None:
@@ -528,7 +532,7 @@ def test_a_configuration_over_conditions_goes_on_where_a_control_group_of_anothe
     first = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=OVER_LOOKS, rule=rule)
     again = partial(verify, scripted("1" * 200), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, rule=rule)
     found = again(trials=OVER_LOOKS, clean=first.clean_trials)
-    assert (found.adversarial.trials, len(found.clean_trials), found.renders) == (30, 60, 30)
+    assert (found.adversarial_counts.trials, len(found.clean_trials), found.renders) == (30, 60, 30)
 
 
 @pytest.mark.parametrize("counting", [29, 45, 101, 200])
@@ -546,14 +550,14 @@ def test_intervals_over_conditions_cover_as_often_as_they_say(counting: int) -> 
 def test_trials_that_were_asked_for_are_all_made() -> None:
     for told in ("0" * 20, "1" * 20):
         found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=20)
-        assert (found.adversarial.trials, found.clean.trials, found.stopped) == (20, 20, "asked for")
+        assert (found.adversarial_counts.trials, found.clean_counts.trials, found.stopped) == (20, 20, "asked for")
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize(("trials", "rule"), [(20, WORST_CASE), (6, WORST_CASE), (200, OVER_CONDITIONS)])
 def test_the_interval_of_curtailed_trials_covers_as_often_as_it_says(trials: int, rule: Rule) -> None:
     """Exactly, by the probability of every outcome: the failure too many comes at trial n, or never."""
-    failures = rule.allowed(trials) + 1
+    failures = rule.count_allowed_failures(trials) + 1
     for rate in np.linspace(0.005, 0.995, 199):
         covered = 0.0
         for n in range(failures, trials + 1):
@@ -569,10 +573,10 @@ def test_the_trials_of_a_group_are_asked_at_once() -> None:
     asked: list[list[tuple[object, ...]]] = []
 
     def evaluate(queries: Sequence[Query]) -> list[Evaluation]:
-        asked.append([(one.kind, one.number, one.spp, one.phase, one.keep) for one in queries])
+        asked.append([(one.kind, one.number, one.spp, one.phase, one.with_image) for one in queries])
         return list(noisy(-1.0, 1.0, 0.0)(queries))
 
-    verify(evaluate, DOMAIN, WORST, claim=Ending.FOUND, spp=4, seed=0, trials=3, kind="baseline", keep=1)
+    verify(evaluate, DOMAIN, WORST, claim=Ending.FOUND, spp=4, seed=0, trials=3, kind="baseline", n_images=1)
     control = [("control", number, 4, None, False) for number in range(3)]
     assert asked == [control, [("baseline", number, 4, None, number == 0) for number in range(3)]]
 
@@ -580,7 +584,7 @@ def test_the_trials_of_a_group_are_asked_at_once() -> None:
 def test_a_nan_margin_is_neither_right_nor_wrong() -> None:
     nothing = partial(map, lambda query: judged(math.nan))
     result = verify(nothing, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=4)
-    assert (result.clean.successes, result.adversarial.successes) == (0, 0)
+    assert (result.clean_counts.successes, result.adversarial_counts.successes) == (0, 0)
     assert result.ending is not Ending.FOUND
 
 

@@ -11,9 +11,16 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
-from advsearch.attacks.candidates import RATIO, Bracket, confirmed, scaled, shrunk, smallest
+from advsearch.attacks.candidates import (
+    RATIO,
+    Bracket,
+    confirm_bracket,
+    find_smallest_change,
+    scale_domain,
+    shrink_towards_start,
+)
 from advsearch.errors import InputError
-from advsearch.questions.region.boxes import grow
+from advsearch.questions.region.boxes import grow_box
 
 NORMS = {"linf": lambda w: float(w.abs().sum()), "l2": lambda w: float(w.norm())}
 
@@ -43,9 +50,9 @@ def test_the_smallest_epsilon_of_a_linear_model_is_within_five_per_cent(
     def found(inside: Domain, number: int) -> Tensor:
         return search(partial(map, evaluate), inside, make_policy("pgd"), steps=20, seed=number).best_u
 
-    bracket = smallest(found, lambda u, _: value(u) > 0.0, domain)
-    assert bracket.u is not None and bracket.closed
-    assert scaled(domain, bracket.high).contains(bracket.u) and value(bracket.u) > 0.0
+    bracket = find_smallest_change(found, lambda u, _: value(u) > 0.0, domain)
+    assert bracket.u is not None and bracket.is_closed
+    assert scale_domain(domain, bracket.high).contains(bracket.u) and value(bracket.u) > 0.0
     assert share <= bracket.high <= RATIO * share  # the closed form
     assert bracket.low <= share
     assert bracket.searches <= 12
@@ -71,8 +78,8 @@ def test_a_guess_saves_trials_and_changes_no_bracket(off: float | None) -> None:
     def found(inside: Domain, number: int) -> Tensor:
         return inside.project(inside.start + 100.0 * weights)
 
-    bracket = smallest(found, passes, domain, None if off is None else likely)
-    assert bracket.u is not None and bracket.closed and value(bracket.u) > 0.0
+    bracket = find_smallest_change(found, passes, domain, None if off is None else likely)
+    assert bracket.u is not None and bracket.is_closed and value(bracket.u) > 0.0
     assert 0.3 <= bracket.high <= RATIO * 0.3 and bracket.low <= 0.3
     assert checks == bracket.checks
     assert checks <= {None: 16, 1.0: 8, 1.02: 10, 0.9: 14, 1.3: 16}.get(off, 22)
@@ -84,32 +91,32 @@ def test_an_end_that_passed_by_luck_moves_out_until_it_passes_again() -> None:
     def margin(u: Tensor) -> float:
         return float((u - domain.start) @ weights) + bias
 
-    edge = shrunk(domain, domain.start + 0.4 * weights.sign(), 0.5)
+    edge = shrink_towards_start(domain, domain.start + 0.4 * weights.sign(), 0.5)
     lucky = Bracket(0.48, 0.5, edge, 3, 10)
-    sure = confirmed(lucky, lambda u, _: margin(u) > 0.02 * -bias, domain)
+    sure = confirm_bracket(lucky, lambda u, _: margin(u) > 0.02 * -bias, domain)
     assert 0.5 < sure.high <= 0.5 * RATIO and sure.u is not None and margin(sure.u) > 0.0
-    assert scaled(domain, sure.high).contains(sure.u)
-    assert confirmed(lucky, lambda u, _: True, domain).high == 0.5
+    assert scale_domain(domain, sure.high).contains(sure.u)
+    assert confirm_bracket(lucky, lambda u, _: True, domain).high == 0.5
     nothing = Bracket(1.0, math.inf, None, 1, 1)
-    assert confirmed(nothing, lambda u, _: False, domain) is nothing
+    assert confirm_bracket(nothing, lambda u, _: False, domain) is nothing
 
 
 def test_without_a_flip_the_whole_budget_is_the_lower_end() -> None:
     domain, _, _ = linear(5, "linf", 1.0)
-    bracket = smallest(lambda inside, _: inside.start, lambda u, _: False, domain)
+    bracket = find_smallest_change(lambda inside, _: inside.start, lambda u, _: False, domain)
     assert (bracket.low, bracket.high, bracket.u, bracket.searches) == (1.0, math.inf, None, 1)
-    assert not bracket.closed
+    assert not bracket.is_closed
 
 
 def test_a_range_has_no_smallest_epsilon() -> None:
     domain = Domain(torch.tensor([0.5, 0.5]), (Block(1, name="pose.yaw"), Block(1, name="pose.pitch")))
     with pytest.raises(InputError, match=r"smallest: expected controls with a budget .*got pose, whose"):
-        scaled(domain, 0.5)
+        scale_domain(domain, 0.5)
 
 
 def test_a_region_fills_the_box_in_which_the_prediction_stays() -> None:
     low, high = torch.tensor([0.2, 0.0, 0.3]), torch.tensor([0.7, 1.0, 0.6])
-    region = grow(lambda u, _: bool(((u >= low) & (u <= high)).all()), torch.tensor([0.5, 0.5, 0.4]), seed=1)
+    region = grow_box(lambda u, _: bool(((u >= low) & (u <= high)).all()), torch.tensor([0.5, 0.5, 0.4]), seed=1)
     assert bool((region.low >= low).all()) and bool((region.high <= high).all())
     assert region.volume > 0.8 * float((high - low).prod())
     assert region.same == region.samples == 200 and region.interval[0] > 0.97
@@ -117,7 +124,7 @@ def test_a_region_fills_the_box_in_which_the_prediction_stays() -> None:
 
 def test_a_region_in_a_disc_keeps_what_it_promises() -> None:
     centre = torch.tensor([0.5, 0.45])
-    region = grow(lambda u, _: float((u - 0.5).norm()) < 0.3, centre, seed=3)
+    region = grow_box(lambda u, _: float((u - 0.5).norm()) < 0.3, centre, seed=3)
     points = torch.lerp(region.low, region.high, torch.rand(20_000, 2, generator=torch.Generator().manual_seed(9)))
     share = float(((points - 0.5).norm(dim=1) < 0.3).float().mean())
     assert region.interval[0] <= share + 0.01 and share > 0.95
@@ -127,11 +134,11 @@ def test_a_region_in_a_disc_keeps_what_it_promises() -> None:
 
 def test_a_point_alone_is_its_own_region() -> None:
     centre = torch.tensor([0.5, 0.5])
-    region = grow(lambda u, _: bool((u == centre).all()), centre, seed=0, samples=20)
+    region = grow_box(lambda u, _: bool((u == centre).all()), centre, seed=0, samples=20)
     assert region.volume == 0.0 and region.same == 20
 
 
 @pytest.mark.parametrize(("centre", "samples"), [(torch.tensor([1.5]), 10), (torch.tensor([0.5]), 0)])
 def test_a_region_refuses_what_it_cannot_do(centre: Tensor, samples: int) -> None:
     with pytest.raises(InputError):
-        grow(lambda u, _: True, centre, seed=0, samples=samples)
+        grow_box(lambda u, _: True, centre, seed=0, samples=samples)

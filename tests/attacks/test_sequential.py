@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from advsearch.errors import InputError
-from advsearch.statistics.sequential import STAKES, ConfidenceSequence, capital, draws_needed
+from advsearch.statistics.sequential import STAKES, ConfidenceSequence, count_needed_samples, log_capital_of_counts
 
 STUDY = Path(__file__).resolve().parents[2] / "benchmarks" / "sequential.py"
 
@@ -24,8 +24,8 @@ def of(*values: float, confidence: float = 0.95) -> ConfidenceSequence:
 def test_the_capital_is_that_of_the_bets_made_one_after_the_other() -> None:
     draws, mean = [1.0, 0.0, 0.5, 1.0, 1.0], 0.4
     made = [math.prod(1.0 - stake + stake * one / mean for one in draws) for stake in STAKES]
-    assert math.exp(capital(mean, {1.0: 3, 0.0: 1, 0.5: 1})) == pytest.approx(sum(made) / len(made))
-    assert capital(mean, {}) == 0.0, "1 before any draw"
+    assert math.exp(log_capital_of_counts(mean, {1.0: 3, 0.0: 1, 0.5: 1})) == pytest.approx(sum(made) / len(made))
+    assert log_capital_of_counts(mean, {}) == 0.0, "1 before any draw"
 
 
 def test_an_interval_holds_what_is_not_excluded_and_nothing_else() -> None:
@@ -82,7 +82,7 @@ def test_a_claim_of_one_side_is_wrong_no_more_often_and_takes_fewer_draws() -> N
 
 @pytest.mark.parametrize(("mean", "value"), [(0.5, 1.0), (0.9, 1.0), (0.99, 1.0), (0.475, 0.5)])
 def test_the_draws_that_a_claim_needs_are_the_fewest_that_show_it(mean: float, value: float) -> None:
-    needed = draws_needed(mean, confidence=0.95, value=value)
+    needed = count_needed_samples(mean, confidence=0.95, value=value)
     sequence = ConfidenceSequence(sides=1)
     for count in range(1, needed + 1):
         sequence.add(value)

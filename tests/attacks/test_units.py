@@ -11,13 +11,13 @@ from scipy.stats import fisher_exact
 
 from advsearch.errors import InputError
 from advsearch.statistics.clustered import (
-    fewer_by_chance,
+    compare_paired,
+    max_lower_bound,
     mean_interval,
-    mean_share,
-    most_shown,
-    paired_by_unit,
-    per_unit,
-    share_interval,
+    mean_rate,
+    one_sided_p_value,
+    rate_interval,
+    sum_per_unit,
 )
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.statistics.paired import mcnemar, paired_difference
@@ -36,13 +36,13 @@ def drives(rng: np.random.Generator, count: int, share: float, alike: float) -> 
 def test_of_independent_predictions_the_exact_intervals_and_tests_are_taken() -> None:
     units = np.arange(20)
     first, second = units < 12, (units >= 3) & (units < 19)
-    assert share_interval(first, np.ones(20)) == clopper_pearson(12, 20)
-    difference, interval, p = paired_by_unit(first, second, units)
+    assert rate_interval(first, np.ones(20)) == clopper_pearson(12, 20)
+    difference, interval, p = compare_paired(first, second, units)
     assert (difference, interval) == paired_difference(9, 3, 7, 1) and p == mcnemar(3, 7)
     under = units < 8
     exact = fisher_exact([[2, 6], [10, 2]], alternative="less").pvalue
     right = np.isin(units, [0, 1, *range(8, 18)])
-    assert fewer_by_chance(right & under, under, right & ~under, ~under) == pytest.approx(exact)
+    assert one_sided_p_value(right & under, under, right & ~under, ~under) == pytest.approx(exact)
 
 
 def test_of_units_it_is_the_interval_by_bets_and_units_of_equal_predictions_are_draws() -> None:
@@ -50,18 +50,18 @@ def test_of_units_it_is_the_interval_by_bets_and_units_of_equal_predictions_are_
     sequence = ConfidenceSequence()
     for one in counts:
         sequence.add(one / 8)
-    assert share_interval(counts, np.full(6, 8)) == pytest.approx(sequence.interval)
+    assert rate_interval(counts, np.full(6, 8)) == pytest.approx(sequence.interval)
     assert mean_interval([one / 8 for one in counts], 0.0, 1.0) == pytest.approx(sequence.interval)
     low, high = mean_interval([2.0 + one for one in counts], 2.0, 10.0)
     assert (low, high) == pytest.approx(tuple(2.0 + 8.0 * end for end in sequence.interval))
-    assert share_interval([0, 3, 0], [2, 4, 0]) == share_interval([3, 0], [4, 2]), "a unit without answers says nothing"
+    assert rate_interval([0, 3, 0], [2, 4, 0]) == rate_interval([3, 0], [4, 2]), "a unit without answers says nothing"
     assert mean_interval([3.0, 3.0], 3.0, 3.0) == (3.0, 3.0)
     with pytest.raises(InputError, match="one prediction at least"):
-        share_interval([0, 0], [0, 0])
+        rate_interval([0, 0], [0, 0])
 
 
 def test_few_units_show_little_and_more_show_more() -> None:
-    shown = [most_shown(n) for n in (1, 3, 5, 10, 30, 100)]
+    shown = [max_lower_bound(n) for n in (1, 3, 5, 10, 30, 100)]
     assert shown == sorted(shown) and 0.3 < shown[2] < 0.45 and shown[-1] > 0.94
 
 
@@ -69,10 +69,10 @@ def test_copies_of_a_prediction_say_no_more_than_one() -> None:
     rng = np.random.default_rng(0)
     one, other = rng.random((2, 40)) < 0.5
     units = np.repeat(np.arange(40), 9)
-    low, high = share_interval(per_unit(np.repeat(one, 9), units), np.full(40, 9))
+    low, high = rate_interval(sum_per_unit(np.repeat(one, 9), units), np.full(40, 9))
     alone = clopper_pearson(int(one.sum()), 40)
     assert low < alone[0] and alone[1] < high
-    p = paired_by_unit(np.repeat(one, 9), np.repeat(other, 9), units)[2]
+    p = compare_paired(np.repeat(one, 9), np.repeat(other, 9), units)[2]
     assert p >= mcnemar(int((one & ~other).sum()), int((~one & other).sum()))
 
 
@@ -84,7 +84,7 @@ def test_two_models_that_are_as_good_are_told_apart_in_5_of_100_at_most(count: i
     units = np.repeat(np.arange(count), FRAMES)
     for _ in range(150):
         first, second = (drives(rng, count, 0.8, alike).ravel() for _ in range(2))
-        difference, (low, high), p = paired_by_unit(first, second, units)
+        difference, (low, high), p = compare_paired(first, second, units)
         told, missed = told + (p <= 0.05), missed + (not low <= 0.0 <= high)
         assert (p <= 0.05) == (not low <= 0.0 <= high) and low <= difference <= high
     assert told <= 12 and missed <= 12
@@ -98,7 +98,7 @@ def test_a_small_loss_in_nearly_all_drives_is_no_gain_in_the_mean() -> None:
         lost = rng.random(12) < 0.1
         first, second = np.zeros((2, 12, 9), bool)
         first[lost], second[~lost, 0] = True, True
-        told += paired_by_unit(first.ravel(), second.ravel(), np.repeat(np.arange(12), 9))[2] <= 0.05
+        told += compare_paired(first.ravel(), second.ravel(), np.repeat(np.arange(12), 9))[2] <= 0.05
     assert told <= 15
 
 
@@ -113,7 +113,7 @@ def fewer(rng: np.random.Generator, side: str, count: int, less: float) -> float
     """How likely it is by chance that drives are right as seldom on one side, where they are so much less."""
     under = SIDES[side](rng, count)
     right = np.where(under, drives(rng, count, 0.8 - less, 0.4), drives(rng, count, 0.8, 0.4))
-    return fewer_by_chance(*(one.sum(axis=1) for one in (right & under, under, right & ~under, ~under)))
+    return one_sided_p_value(*(one.sum(axis=1) for one in (right & under, under, right & ~under, ~under)))
 
 
 @pytest.mark.medium
@@ -122,7 +122,7 @@ def test_a_rule_that_is_none_is_told_in_one_of_100_and_a_clear_one_always(side: 
     rng = np.random.default_rng(2)
     assert sum(fewer(rng, side, count, 0.0) <= 0.01 for count in (6, 12, 40) for _ in range(100)) <= 9
     assert sum(fewer(rng, side, 60, 0.6) <= 0.01 for _ in range(20)) == 20
-    assert fewer_by_chance([1, 2], [8, 8], [0, 0], [0, 0]) == 1.0, "nothing is elsewhere"
+    assert one_sided_p_value([1, 2], [8, 8], [0, 0], [0, 0]) == 1.0, "nothing is elsewhere"
 
 
 # ---- units of unequal size -------------------------------------------------------------------------------------------
@@ -150,19 +150,19 @@ def test_the_interval_over_units_of_unequal_size_covers_their_mean(
     covered, runs = 0, 300
     for _ in range(runs):
         counted, of = unequal(rng, count, rare, small, large)
-        low, high = share_interval(counted, of)
+        low, high = rate_interval(counted, of)
         covered += low <= truth <= high
-        assert low <= mean_share(counted, of) <= high
+        assert low <= mean_rate(counted, of) <= high
     assert covered >= 0.94 * runs
 
 
 def test_all_units_weigh_the_same() -> None:
-    assert mean_share([1, 3, 0], [1, 12, 0]) == pytest.approx((1.0 + 0.25) / 2)
+    assert mean_rate([1, 3, 0], [1, 12, 0]) == pytest.approx((1.0 + 0.25) / 2)
     units = np.repeat([0, 1], [1, 12])
     first, second = np.arange(13) < 1, np.arange(13) > 6
-    difference, (low, high), p = paired_by_unit(first, second, units)
+    difference, (low, high), p = compare_paired(first, second, units)
     assert difference == pytest.approx((0.0 - 1.0 + 0.5 - 0.0) / 2) and low < difference < high and p > 0.05
-    assert paired_by_unit(first, second, np.zeros(13, np.int64))[2] == 1.0, "one unit shows nothing"
+    assert compare_paired(first, second, np.zeros(13, np.int64))[2] == 1.0, "one unit shows nothing"
 
 
 @pytest.mark.parametrize("count", [5, 12, 30])
@@ -175,7 +175,7 @@ def test_two_models_as_good_over_units_of_unequal_size_are_told_apart_in_5_of_10
         is_gain = is_large[units]
         second = np.where(is_gain, True, rng.random(len(units)) < 8.0 / 9.0)
         first = np.where(is_gain, False, True)
-        _, (low, high), p = paired_by_unit(first, second, units)
+        _, (low, high), p = compare_paired(first, second, units)
         told, missed = told + (p <= 0.05), missed + (not low <= 0.0 <= high)
     assert told <= 0.06 * runs and missed <= 0.06 * runs
 
@@ -190,5 +190,5 @@ def test_a_rule_of_no_effect_on_the_mean_of_unequal_units_is_told_in_2_of_100_at
         of = np.where(rng.random(count) < np.where(is_under, 0.8, 0.2), 1, LARGE)
         inside = np.where(is_under, of, 0)
         outside = np.where(is_under, LARGE if is_cut else 0, of)
-        told += fewer_by_chance(rng.binomial(inside, 0.7), inside, rng.binomial(outside, 0.7), outside) <= 0.01
+        told += one_sided_p_value(rng.binomial(inside, 0.7), inside, rng.binomial(outside, 0.7), outside) <= 0.01
     assert told <= 0.02 * runs

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from advsearch.attacks import Ending
-from advsearch.attacks.trials import CONDITIONS, OVER_LADDER, affordable, choose_rate_spp, moved
+from advsearch.attacks.trials import N_CONDITIONS, OVER_LADDER, choose_rate_spp, estimate_moved_fraction, limit_ladder
 from advsearch.attacks.verification import TRIAL_LOOKS
 
 
@@ -65,7 +65,7 @@ def test_conditions_near_the_decision_ask_for_no_more_samples() -> None:
     """Noise moves them to one side as often as to the other: the rate stays."""
     counts = [choose_rate_spp({"answer": steady(0.2), "clean": steady(0.2)}, seed=seed) for seed in range(10)]
     assert sum(one.spp == 16 for one in counts) >= 8 and all(one.converged for one in counts)
-    assert counts[0].renders == 2 * 2 * CONDITIONS
+    assert counts[0].renders == 2 * 2 * N_CONDITIONS
 
 
 def test_noise_that_moves_the_rate_does_and_what_no_rung_settles_is_said() -> None:
@@ -78,13 +78,15 @@ def test_noise_that_moves_the_rate_does_and_what_no_rung_settles_is_said() -> No
 
 def test_the_share_that_moves_is_that_of_a_mean_change() -> None:
     here = np.linspace(-10.0, 10.0, 200)
-    assert moved(here, here) == 0.0
-    assert moved(here, here - 1.0) == pytest.approx(0.05, abs=0.005), "a twentieth lies within 1 of zero"
+    assert estimate_moved_fraction(here, here) == 0.0
+    assert estimate_moved_fraction(here, here - 1.0) == pytest.approx(0.05, abs=0.005), (
+        "a twentieth lies within 1 of zero"
+    )
 
 
 def test_a_check_takes_no_more_than_its_share_of_the_searches() -> None:
-    assert affordable(OVER_LADDER, 600, searched=76_800) == list(OVER_LADDER)
-    assert affordable(OVER_LADDER, 600, searched=5_000) == list(OVER_LADDER[:2])
+    assert limit_ladder(OVER_LADDER, 600, search_samples=76_800) == list(OVER_LADDER)
+    assert limit_ladder(OVER_LADDER, 600, search_samples=5_000) == list(OVER_LADDER[:2])
 
 
 @pytest.mark.parametrize("number", [0, 20, 60])

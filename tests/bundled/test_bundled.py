@@ -11,10 +11,10 @@ import pytest
 
 from advsearch.errors import UnknownNameError
 from advsearch.questions.harden.objects import HOUSEHOLD, OBJECTS, STREET
-from advsearch.questions.harden.objects.shapes import carved, grid
-from advsearch.questions.harden.objects.textures import Draw
+from advsearch.questions.harden.objects.shapes import carve_patches, grid
+from advsearch.questions.harden.objects.textures import ParameterSampler
 from advsearch.scene import library
-from advsearch.scene.assets import Mesh, ObjectAsset, normalised
+from advsearch.scene.assets import Mesh, ObjectAsset, normalise_mesh
 from scenes import build, files
 from scenes.environments import ENVIRONMENTS
 from scenes.environments.panorama import HEIGHT, LEVEL, brightness, directions, irradiance
@@ -80,7 +80,7 @@ def test_a_mesh_is_sound(name: str, seed: int | None) -> None:
     agree = (normals * mesh.normals.astype(np.float64)[mesh.faces].mean(axis=1)).sum(axis=1)
     assert (agree > 0.0).mean() > 0.998, "shading normals against the winding"
 
-    again = normalised(mesh)
+    again = normalise_mesh(mesh)
     assert again.vertices[:, 2].min() == 0.0
     np.testing.assert_allclose(again.vertices, mesh.vertices, atol=2e-6)
     volume = np.einsum("ij,ij->i", corners(mesh)[:, 0], normals).sum() / 6
@@ -112,7 +112,7 @@ def test_charts_lie_apart_in_the_atlas(name: str, seed: int | None) -> None:
 @pytest.mark.medium
 @pytest.mark.parametrize("name", sorted(OBJECTS))
 def test_charts_are_about_as_large_as_their_surface(name: str) -> None:
-    patches = OBJECTS[name].make(Draw(None)).patches
+    patches = OBJECTS[name].make(ParameterSampler(None)).patches
     a, b, c = (np.concatenate([p.vertices[p.faces[:, i]] for p in patches]) for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     surface = np.add.reduceat(area, np.cumsum([0] + [len(p.faces) for p in patches[:-1]]))
@@ -155,7 +155,7 @@ def test_carving_splits_a_surface_along_a_curve() -> None:
     at = np.linspace(0.0, 1.0, 9)
     points = np.stack([*np.meshgrid(at, at), np.zeros((9, 9))], axis=-1)
     whole = grid("x", points, np.broadcast_to([0.0, 0.0, 1.0], points.shape), (1.0, 1.0), at, at)
-    rest, disc = carved([whole], lambda p: 0.3 - np.hypot(p[:, 0] - 0.5, p[:, 1] - 0.5), "disc")
+    rest, disc = carve_patches([whole], lambda p: 0.3 - np.hypot(p[:, 0] - 0.5, p[:, 1] - 0.5), "disc")
     areas = {}
     for part in (rest, disc):
         a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
@@ -167,7 +167,7 @@ def test_carving_splits_a_surface_along_a_curve() -> None:
     used = np.unique(disc.faces)
     found = disc.rest(disc.uvs[used, 0], disc.uvs[used, 1])
     np.testing.assert_allclose(found, disc.vertices[used], atol=1e-9)
-    (left,) = carved([whole], lambda p: 0.3 - p[:, 0], None)
+    (left,) = carve_patches([whole], lambda p: 0.3 - p[:, 0], None)
     assert left.vertices[np.unique(left.faces)][:, 0].min() == pytest.approx(0.3)
 
 

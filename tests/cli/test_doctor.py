@@ -106,9 +106,9 @@ def test_a_process_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_llvm_tells_which_was_chosen_and_why_others_were_not(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen, other = Path("/lib/libLLVM.so.19.1"), Path("/lib/libLLVM-15.so.1")
-    candidates = [llvm.LibraryFile(chosen, (19, 1)), llvm.LibraryFile(other, (15,), llvm.refusal((15,)))]
-    monkeypatch.delenv(llvm.VARIABLE, raising=False)
-    monkeypatch.setattr(llvm, "find", lambda: candidates)
+    candidates = [llvm.LibraryFile(chosen, (19, 1)), llvm.LibraryFile(other, (15,), llvm.explain_refusal((15,)))]
+    monkeypatch.delenv(llvm.ENVIRONMENT_VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "find_libraries", lambda: candidates)
     monkeypatch.setattr(llvm, "ensure_llvm", lambda: llvm.LibraryFile(chosen, (19, 1)))
     part = doctor.check_llvm()
     assert (part.version, part.status, part.fix) == ("19.1", doctor.OK, "")
@@ -117,18 +117,18 @@ def test_llvm_tells_which_was_chosen_and_why_others_were_not(monkeypatch: pytest
 
 
 def test_llvm_without_a_usable_one_tells_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(llvm.VARIABLE, raising=False)
-    monkeypatch.setattr(llvm, "find", lambda: [])
+    monkeypatch.delenv(llvm.ENVIRONMENT_VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "find_libraries", lambda: [])
     part = doctor.check_llvm()
     assert part.status == doctor.MISSING
-    assert llvm.install_command() in part.fix and llvm.VARIABLE in part.fix
+    assert llvm.get_install_command() in part.fix and llvm.ENVIRONMENT_VARIABLE in part.fix
 
 
 def test_llvm_that_the_variable_names_wrongly_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so")
+    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, "/nowhere/libLLVM.so")
     part = doctor.check_llvm()
     assert part.status == doctor.BROKEN and "does not exist" in part.detail
-    assert part.fix == f"unset {llvm.VARIABLE}"
+    assert part.fix == f"unset {llvm.ENVIRONMENT_VARIABLE}"
 
 
 def test_a_cache_folder_that_cannot_be_made_is_a_warning(tmp_path: Path) -> None:
@@ -156,14 +156,14 @@ def test_every_part_really_works_here() -> None:
 @pytest.mark.medium
 def test_an_old_llvm_takes_the_probe_down_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the guard switched off, as a user has it who calls Mitsuba by hand."""
-    old = [c.path for c in llvm.find() if c.version and c.version[0] in (15, 16)]
+    old = [c.path for c in llvm.find_libraries() if c.version and c.version[0] in (15, 16)]
     if not old:
         pytest.skip("no libLLVM 15 or 16 on this machine")
     code = (
         "import runpy, advsearch.scene.mitsuba_backend.llvm as llvm, advsearch.cli.doctor_probe as probe\n"
         "llvm.MINIMUM = 15; probe.TRIALS = {'render': probe.probe_renderer}; probe.main()"
     )
-    monkeypatch.setenv(llvm.VARIABLE, str(old[0]))
+    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, str(old[0]))
     monkeypatch.setenv("HOME", os.devnull + "/none")  # no kernels from an earlier render
     tried = doctor.run_probe(process_that(code))
     if tried.get("render", (False, ""))[0]:

@@ -14,7 +14,7 @@ import advsearch
 from advsearch import models
 from advsearch.cli.main import main
 from advsearch.errors import InputError, UnknownNameError, resembling
-from advsearch.models import find_label_set, matching_labels, read_labels
+from advsearch.models import find_label_set, find_similar_labels, read_labels
 from advsearch.models.labels import SETS
 
 LABELS = ("pug", "coffee mug", "frying pan, frypan", "giant panda", "cup", "mosque", "crane", "crane", "glasses")
@@ -54,8 +54,8 @@ def test_a_name_of_any_length_is_compared_at_once() -> None:
 
 
 def test_labels_match_by_their_synonyms() -> None:
-    assert matching_labels("pan", LABELS) == [(2, "frying pan"), (3, "giant panda")]
-    assert matching_labels("crane", LABELS) == [(6, "crane"), (7, "crane")]
+    assert find_similar_labels("pan", LABELS) == [(2, "frying pan"), (3, "giant panda")]
+    assert find_similar_labels("crane", LABELS) == [(6, "crane"), (7, "crane")]
     with pytest.raises(InputError, match=r"no label 'mug'\. Did you mean 'coffee mug' \(#1\) or 'cup' \(#4\)\?$"):
         find_label_set("mug", LABELS)
     with pytest.raises(InputError, match=r"no label 'pan'\. Did you mean 'frying pan' \(#2\) or 'giant panda'"):

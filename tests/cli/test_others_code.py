@@ -21,7 +21,7 @@ from advsearch.cli.main import list_commands, main
 from advsearch.cluster import WorkerTask
 from advsearch.cluster.worker import run_batch
 from advsearch.errors import InputError
-from advsearch.questions.attack.carry_out import parts_in
+from advsearch.questions.attack.carry_out import load_parts_of_run
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import attacks_of
 from advsearch.questions.photographs.carry_out import Photographs
@@ -176,7 +176,7 @@ def test_what_is_typed_behind_a_file_is_imported(typed: str) -> None:
 
 
 def in_a_worker() -> None:
-    settings = AttackConfig(object="mug", model=NAME, controls={"pose": {}}).plain()
+    settings = AttackConfig(object="mug", model=NAME, controls={"pose": {}}).to_json()
     work = WorkerTask("advsearch.questions.attack.carry_out:attack_worker", settings)
     reply = run_batch(work, [], 60.0)
     assert reply.failure is not None
@@ -188,7 +188,7 @@ def explained() -> None:
 
 
 PYTHON: dict[str, Callable[[], object]] = {
-    "a loaded run": lambda: parts_in(Path("runs/theirs")),
+    "a loaded run": lambda: load_parts_of_run(Path("runs/theirs")),
     "sweep": lambda: advsearch.sweep(adversarial_of="theirs", controls=["light"], samples=2),
     "replay": lambda: advsearch.replay("theirs"),
     "explain": explained,
@@ -197,7 +197,7 @@ PYTHON: dict[str, Callable[[], object]] = {
     "a thread": lambda: Photographs().add(Path("runs/kept"), "0", photograph()),
     "a worker": in_a_worker,
     "a worker of a study": lambda: attacks_of(
-        AttackConfig(object="mug,bowl", model=NAME, controls={"pose": {}}).plain()
+        AttackConfig(object="mug,bowl", model=NAME, controls={"pose": {}}).to_json()
     )([0]),
 }
 
@@ -254,11 +254,11 @@ def test_what_is_no_name_of_code_is_refused(name: str) -> None:
 def test_processes_that_we_start_look_for_no_modules_in_the_current_folder(module: str) -> None:
     import io
 
-    from advsearch.scene.mitsuba_backend.llvm import asked_version
+    from advsearch.scene.mitsuba_backend.llvm import query_version
     from advsearch.trust.foreign_code import try_torchscript
 
     Path(f"{module}.py").write_text("open('imported', 'w').close()")
-    asked_version("libnone.so")
+    query_version("libnone.so")
     if module == "torch":
         assert try_torchscript(io.BytesIO(b"")) == ""
     assert not Path("imported").exists()

@@ -19,9 +19,9 @@ from typing import Any
 import pytest
 
 from advsearch.cluster import WorkerDiedError, Workers, WorkerStats, WorkerTask
-from advsearch.cluster.dask_executor import CLASSES, TRIES, DaskExecutor, site_of
+from advsearch.cluster.dask_executor import CLUSTER_CLASSES, MAX_TRIES, DaskExecutor, parse_site
 from advsearch.cluster.local import LocalExecutor
-from advsearch.cluster.worker import Failure, Reply, run_batch, version
+from advsearch.cluster.worker import Failure, Reply, compute_version, run_batch
 from advsearch.cluster.workers import open_workers
 from advsearch.errors import ClusterError, FileFormatError, InputError
 from conftest import ROOT
@@ -42,7 +42,7 @@ def pieces(count: int) -> Iterator[range]:
 def check(executor: Workers | None, count: int, added: int = 0) -> None:
     """All numbers come back once and squared."""
     assert executor is not None
-    found = {n: v for done in executor.results(pieces(count)) for n, v in zip(done.items, done.value, strict=True)}
+    found = {n: v for done in executor.compute(pieces(count)) for n, v in zip(done.items, done.value, strict=True)}
     assert found == {number: number * number + added for number in range(count)}
 
 
@@ -59,7 +59,7 @@ def test_processes_of_this_machine_are_killed_and_nothing_is_lost(capfd: pytest.
         assert executor is not None
         seen: dict[int, Any] = {}
         lost: dict[int, str] = {}
-        for count, done in enumerate(executor.results(pieces(400))):
+        for count, done in enumerate(executor.compute(pieces(400))):
             seen |= dict.fromkeys(done.items, done.value)
             lost |= {done.items[0]: done.lost} if done.lost else {}
             if count == 20:
@@ -68,7 +68,7 @@ def test_processes_of_this_machine_are_killed_and_nothing_is_lost(capfd: pytest.
                 assert all(os.getsid(one.pid) == one.pid for one in workers)
                 workers[0].kill()
         assert len(seen) == 400 and list(lost) == [301]
-        facts = executor.facts
+        facts = executor.stats
         assert facts is not None and facts.lost >= 4 and facts.most == 2
     assert not own_workers() and "printed" not in capfd.readouterr().out
 
@@ -103,7 +103,7 @@ def test_a_worker_has_no_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with open_workers(WorkerTask("asking:work", {}), workers=1, cluster=None, tell=print) as executor:
         assert executor is not None
         with pytest.raises(ClusterError, match="a module that a worker imports asks for workers itself"):
-            list(executor.results(pieces(4)))
+            list(executor.compute(pieces(4)))
 
 
 @pytest.mark.medium
@@ -183,7 +183,7 @@ def test_a_scheduler_and_workers_of_their_own(tmp_path: Path, monkeypatch: pytes
         with open_workers(work, workers=None, cluster=f"tcp://127.0.0.1:{port}", tell=told.append) as executor:
             check(executor, 40, added=7)
             assert executor is not None
-            results = executor.results(pieces(200))
+            results = executor.compute(pieces(200))
             seen = [number for _ in range(10) for number in next(results).items]
             fetch = distributed.Client._gather_remote
 
@@ -218,7 +218,7 @@ def test_a_scheduler_that_went_and_came_back_between_two_looks_is_noticed(monkey
         status="running",
         scheduler_comm=connection,
         scheduler=SimpleNamespace(ncores=None),
-        sync=lambda function, *args, **__: {"a": version()},
+        sync=lambda function, *args, **__: {"a": compute_version()},
     )
     now = time.monotonic()
     executor = executor_of_nobody(
@@ -226,7 +226,7 @@ def test_a_scheduler_that_went_and_came_back_between_two_looks_is_noticed(monkey
     )
     again = list[object]()
     monkeypatch.setattr(executor, "_reconnect", lambda: again.append(client.scheduler_comm))
-    monkeypatch.setattr("advsearch.cluster.dask_executor.LOOK", 0.0)
+    monkeypatch.setattr("advsearch.cluster.dask_executor.LOOK_SECONDS", 0.0)
     assert executor.count_workers() == 1 and not again
     client.scheduler_comm = object()
     executor.count_workers()
@@ -250,8 +250,10 @@ def looked_at(versions: dict[str, Any], seconds: float) -> tuple[int, list[str]]
 
 
 def test_a_worker_of_another_version_is_refused_with_both() -> None:
-    refused = f"it has advsearch 2, and {version()} asks; install the same on both"
-    count, told = looked_at({"a": version(), "b": "2", "c": ImportError("no advsearch"), "d": OSError("going")}, 0.0)
+    refused = f"it has advsearch 2, and {compute_version()} asks; install the same on both"
+    count, told = looked_at(
+        {"a": compute_version(), "b": "2", "c": ImportError("no advsearch"), "d": OSError("going")}, 0.0
+    )
     assert count == 1
     assert told == [
         f"b is given nothing: {refused}",
@@ -288,7 +290,7 @@ class Prediction:
 
 def called(monkeypatch: pytest.MonkeyPatch, *answers: Prediction, executor: Any = None) -> Any:
     """What comes of a call whose answers come so, one for each time that it is asked."""
-    monkeypatch.setattr("advsearch.cluster.dask_executor.LOOK", 0.001)
+    monkeypatch.setattr("advsearch.cluster.dask_executor.LOOK_SECONDS", 0.001)
     left = iter(answers)
     plugins = list[Any]()
 
@@ -330,7 +332,7 @@ def test_what_a_worker_cannot_begin_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     """By the state of the call, not by the error's type, which may be the same."""
     for error in (distributed.comm.CommClosedError("its own"), OSError("the disk is gone"), ValueError("a bug")):
         with pytest.raises(ClusterError, match=f"a worker cannot begin .{type(error).__name__}: {error}"):
-            called(monkeypatch, *(Prediction("error", error) for _ in range(TRIES)))
+            called(monkeypatch, *(Prediction("error", error) for _ in range(MAX_TRIES)))
     killed = distributed.KilledWorker("a", SimpleNamespace(address="tcp://here"), 0)
     with pytest.raises(WorkerDiedError, match="no answer: 3 workers died of it"):
         called(monkeypatch, Prediction("error", killed))
@@ -352,8 +354,8 @@ def test_a_worker_that_is_not_fit_is_given_nothing_more(monkeypatch: pytest.Monk
 
 
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.cluster.dask_executor.CONNECT", 1.0)
-    monkeypatch.setattr("advsearch.cluster.dask_executor.RECONNECT", 10_000.0)
+    monkeypatch.setattr("advsearch.cluster.dask_executor.CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr("advsearch.cluster.dask_executor.RECONNECT_SECONDS", 10_000.0)
     begun = time.monotonic()
     with pytest.raises(ClusterError, match=r"tcp://127.0.0.1:9: there is no scheduler that answers"):
         with open_workers(WorkerTask("a:b", {}), workers=None, cluster="tcp://127.0.0.1:9", tell=lambda text: None):
@@ -379,23 +381,23 @@ def test_a_file_of_a_cluster_says_what_is_wrong_and_runs_nothing(tmp_path: Path,
     path = tmp_path / "cluster.yaml"
     path.write_text(text)
     with pytest.raises((InputError, FileFormatError), match=message):
-        site_of(None, str(path))
+        parse_site(None, str(path))
 
 
 def test_a_cluster_is_an_address_a_file_or_this_machine(tmp_path: Path) -> None:
     path = tmp_path / "cluster.yaml"
     path.write_text("address: tls://10.0.0.1:8786\nsecurity: {tls_ca_file: ca.pem, require_encryption: true}")
-    place = site_of(None, str(path))
+    place = parse_site(None, str(path))
     assert place.address == "tls://10.0.0.1:8786"
     assert place.security == {"tls_ca_file": str(tmp_path / "ca.pem"), "require_encryption": True}
-    assert LocalExecutor(3).where == "3 workers on this machine"
+    assert LocalExecutor(3).description == "3 workers on this machine"
     for workers, cluster, message in (
         (2, "tcp://a:1", "leave one of the two out"),
         (None, "a", "expected the address"),
     ):
         with pytest.raises(InputError, match=message):
-            site_of(workers, cluster)
-    assert set(CLASSES.values()) == {"dask_jobqueue", "dask_kubernetes.operator"}
+            parse_site(workers, cluster)
+    assert set(CLUSTER_CLASSES.values()) == {"dask_jobqueue", "dask_kubernetes.operator"}
 
 
 def test_without_dask_the_message_is_the_command(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,9 +17,9 @@ from advsearch.cluster.worker import (
     Failure,
     MissingFilesError,
     Reply,
-    file_digests,
-    find_files,
+    compute_digests,
     read_files,
+    resolve_files,
     run_batch,
     write_files,
 )
@@ -35,7 +35,7 @@ def ranges(count: int = COUNT) -> Iterator[range]:
 
 def run_all(pool: Simulated, count: int = COUNT, tell: Callable[[str], None] = lambda text: None) -> list[BatchResult]:
     """What comes back, checked: each number once, and as it should be."""
-    results = list(SimulatedWorkers(pool, tell).results(ranges(count)))
+    results = list(SimulatedWorkers(pool, tell).compute(ranges(count)))
     numbers = [number for result in results for number in result.items]
     assert sorted(numbers) == list(range(count)), "none is lost, and none comes twice"
     assert all(result.value == list(result.items) for result in results if not result.lost)
@@ -53,10 +53,10 @@ def test_ranges_are_shared_and_few_are_under_way() -> None:
             yield batch
 
     workers = SimulatedWorkers(pool)
-    for count, result in enumerate(workers.results(source()), 1):
+    for count, result in enumerate(workers.compute(source()), 1):
         assert len(taken) - count <= 4 and result.items in taken
     assert pool.most <= 4
-    facts = workers.facts
+    facts = workers.stats
     assert facts.most == facts.workers == 4 and facts.batches == 1250 and facts.retried == facts.lost == 0
     assert facts.busy / facts.alive > 0.99 and facts.busy == pytest.approx(10_000.0)
     assert facts.loading == 4 * pool.load
@@ -104,7 +104,7 @@ def test_what_is_left_waits_for_a_worker_that_is_not_ready(deadly: int) -> None:
     """The one that dies of a number was the only one that was ready, and another has not got ready yet."""
     pool = Simulated(kill={deadly}, load=36.0, again=8.0, lag=0.6)
     pool.add(2)
-    results = SimulatedWorkers(pool).results(range(first, first + 2) for first in range(0, 400, 2))
+    results = SimulatedWorkers(pool).compute(range(first, first + 2) for first in range(0, 400, 2))
     lost = {number: result.lost for result in results for number in result.items}
     assert len(lost) == 400 and [number for number, reason in lost.items() if reason] == [deadly]
 
@@ -124,7 +124,7 @@ def test_what_comes_from_another_machine_says_so() -> None:
     pool = Simulated(call=lambda items: list(items))
     pool.add(2)
     machines = set[str | None]()
-    for result in SimulatedWorkers(pool, told.append).results(ranges()):
+    for result in SimulatedWorkers(pool, told.append).compute(ranges()):
         machines.add(result.machine)
         pool.replies = {"w1": Reply(list(range(SIZE)), 8.0, 0.0, other, "w1")}
     assert len(machines) == 2 and None in machines
@@ -148,11 +148,11 @@ def test_results_that_are_given_up_do_not_answer_what_is_asked_next() -> None:
     pool = Simulated()
     pool.add(2)
     workers = SimulatedWorkers(pool)
-    first = workers.results(ranges(400))
+    first = workers.compute(ranges(400))
     for _ in range(3):
         next(first)
     batches = iter([range(900, 901), range(901, 902)])
-    assert sorted(number for result in workers.results(batches) for number in result.items) == [900, 901]
+    assert sorted(number for result in workers.compute(batches) for number in result.items) == [900, 901]
 
 
 def test_a_worker_says_what_went_wrong(tmp_path: Path) -> None:
@@ -177,14 +177,14 @@ def test_files_of_lists_nodes_and_two_paths_are_read_here_and_found_there(tmp_pa
         "path": f"{here}/camera.csv+{here}/object.csv",
     }
     contents = read_files(WorkerTask("a:b", given, ("object", "path")))
-    task = WorkerTask("a:b", given, ("object", "path"), digests=file_digests(contents))
+    task = WorkerTask("a:b", given, ("object", "path"), digests=compute_digests(contents))
     assert {Path(path).name for path in contents} == {path.name for path in here.iterdir()}
-    assert find_files(task, there).settings == given and not there.exists()
+    assert resolve_files(task, there).settings == given and not there.exists()
     here.rename(tmp_path / "gone")
     with pytest.raises(MissingFilesError, match=str(here)):
-        find_files(task, there)
+        resolve_files(task, there)
     write_files(contents, there)
-    moved: Any = find_files(task, there).settings
+    moved: Any = resolve_files(task, there).settings
     paths = [*moved["object"].split(","), *moved["path"].split("csv+")]
     assert all(path == "bowl" or path.startswith(f"{there}/") for path in paths)
     first, second = moved["path"].split("csv+")

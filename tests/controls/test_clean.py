@@ -13,7 +13,7 @@ import advsearch
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
 from advsearch.controls import Space, make_control, make_space
-from advsearch.controls.base import sentences
+from advsearch.controls.base import describe_adjusted_defaults
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
@@ -21,7 +21,7 @@ from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.results import plain
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.description import DEFAULT_ENVIRONMENT, SceneDescription, describe
+from advsearch.scene.description import DEFAULT_ENVIRONMENT, SceneDescription, load_description
 
 AZIMUTH = {"camera.azimuth": 130.0}
 
@@ -79,7 +79,7 @@ REFUSED: dict[str, tuple[dict[str, float], str | None, dict[str, Any], str]] = {
 def test_a_control_that_leaves_out_what_was_asked_for_is_refused(name: str) -> None:
     given, environment, controls, message = REFUSED[name]
     with pytest.raises(InputError) as error:
-        space_of(describe("mug", environment, given=given), **controls)
+        space_of(load_description("mug", environment, given=given), **controls)
     assert message in with_flags(str(error.value))
 
 
@@ -103,9 +103,9 @@ def test_a_control_that_leaves_out_what_was_asked_for_is_refused(name: str) -> N
 def test_a_control_that_agrees_starts_at_what_was_asked_for(
     given: dict[str, float], environment: str, controls: dict[str, Any]
 ) -> None:
-    scene = describe("mug", environment, given=given)
+    scene = load_description("mug", environment, given=given)
     space = space_of(scene, **controls)
-    assert space.moved == ()
+    assert space.adjusted_defaults == ()
     for name, value in space.describe(space.start).items():
         if name in given and isinstance(value["value"], float):
             assert (value["value"] - given[name]) % 360.0 == pytest.approx(0.0, abs=1e-4)
@@ -123,7 +123,7 @@ def test_the_default_environment_is_asked_for_only_where_it_is_named(
     assert main([*words, *more]) == 0
     (run / "summary.json").unlink()  # as if it had been stopped
     assert main(["resume", str(run), "--quiet"]) == 0
-    assert SweepConfig(object="mug").lit_by == DEFAULT_ENVIRONMENT
+    assert SweepConfig(object="mug").environment_name == DEFAULT_ENVIRONMENT
 
 
 # ---- what nobody asked for moves, and that is said ------------------------------------------------------------------
@@ -152,7 +152,7 @@ MOVED: dict[str, tuple[dict[str, Any], str]] = {
 @pytest.mark.parametrize("name", MOVED)
 def test_a_default_that_is_left_out_moves_and_is_said(name: str) -> None:
     controls, sentence = MOVED[name]
-    (said,) = sentences(space_of(describe("mug"), **controls).moved)
+    (said,) = describe_adjusted_defaults(space_of(load_description("mug"), **controls).adjusted_defaults)
     assert said.startswith("The clean scene has ") and said.endswith(" leaves out.") and sentence in said
 
 
@@ -168,7 +168,7 @@ def test_a_default_that_is_left_out_moves_and_is_said(name: str) -> None:
     ],
 )  # fmt: skip
 def test_where_nothing_moves_nothing_is_said(controls: dict[str, Any]) -> None:
-    assert space_of(describe("mug"), **controls).moved == ()
+    assert space_of(load_description("mug"), **controls).adjusted_defaults == ()
 
 
 class Screen(NullProgress):
@@ -218,8 +218,8 @@ def test_an_exposure_that_is_searched_is_over_the_metered_one_and_not_over_the_o
 
 
 def test_a_distance_that_is_set_does_not_follow_the_field_of_view() -> None:
-    near = describe("mug", given={"camera.distance": 2.0})
-    for scene, stays in ((near, True), (describe("mug"), False)):
+    near = load_description("mug", given={"camera.distance": 2.0})
+    for scene, stays in ((near, True), (load_description("mug"), False)):
         space = space_of(scene, camera={"fov": [20, 60]})
         near_end, far_end = (space.inputs(torch.tensor([share]))["camera.to_world"][:3, 3] for share in (0.0, 1.0))
         assert torch.allclose(near_end, far_end) is stays

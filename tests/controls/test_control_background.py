@@ -9,15 +9,15 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls.background import COLOR, BackgroundControl, hsv_to_rgb
+from advsearch.controls.background import BACKDROP_COLOR, BackgroundControl, hsv_to_rgb
 from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 def test_the_colours_are_those_of_the_standard_library() -> None:
@@ -39,7 +39,7 @@ def test_the_derivatives_are_those_of_differences() -> None:
 def test_every_corner_has_a_finite_colour_and_derivative(scene: SceneDescription, share: float) -> None:
     bound = BackgroundControl().bind(scene)
     u = torch.full((3,), share, requires_grad=True)
-    color = bound.inputs(u)[COLOR]
+    color = bound.inputs(u)[BACKDROP_COLOR]
     color.sum().backward()
     assert color.shape == (3,) and float(color.detach().min()) >= 0.0 and float(color.detach().max()) <= 1.0
     assert u.grad is not None and bool(torch.isfinite(u.grad).all())
@@ -48,7 +48,7 @@ def test_every_corner_has_a_finite_colour_and_derivative(scene: SceneDescription
 def test_it_starts_at_mid_grey_with_a_slope(scene: SceneDescription) -> None:
     bound = BackgroundControl().bind(scene)
     u = bound.start.clone().requires_grad_()
-    color = bound.inputs(u)[COLOR]
+    color = bound.inputs(u)[BACKDROP_COLOR]
     torch.testing.assert_close(color, srgb_to_linear(torch.full((3,), 0.5)))
     (color * torch.tensor([1.0, 2.0, 4.0])).sum().backward()
     assert u.grad is not None and float(u.grad[1].abs()) > 0.1 and float(u.grad[2].abs()) > 0.1
@@ -72,13 +72,13 @@ def test_the_environment_may_be_a_choice(scene: SceneDescription) -> None:
     assert bound.describe(bound.start)["background.what"]["value"] == "environment"
     there = bound.start.clone()
     there[0] = 0.25
-    assert COLOR in bound.inputs(there)
+    assert BACKDROP_COLOR in bound.inputs(there)
 
 
 def test_only_what_is_given_a_range_is_searched(scene: SceneDescription) -> None:
     bound = BackgroundControl(hue=[0, 120], saturation=1.0).bind(scene)
     assert [group.parameter for group in bound.groups] == ["hue"] and not bound.groups[0].periodic
-    color = linear_to_srgb(bound.inputs(torch.tensor([1.0]))[COLOR])
+    color = linear_to_srgb(bound.inputs(torch.tensor([1.0]))[BACKDROP_COLOR])
     torch.testing.assert_close(color, torch.tensor([0.0, 0.5, 0.0]), atol=1e-5, rtol=0)
 
 

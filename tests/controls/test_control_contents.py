@@ -12,11 +12,11 @@ import torch
 
 import advsearch
 from advsearch.controls import make_space
-from advsearch.controls.contents import BRIM, INGREDIENTS, ContentsControl, interior, liquid
+from advsearch.controls.contents import FILL_LIMIT, INGREDIENTS, ContentsControl, find_interior, mix_liquid_color
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.library import list_objects, load_object
 
 VESSELS = {"bottle", "bowl", "frying-pan", "mug", "vase", "wine-glass"}
@@ -26,7 +26,7 @@ AGREEMENT = 0.1
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 def bound(scene: SceneDescription, **settings: Any) -> ContentsControl:
@@ -57,29 +57,29 @@ def cup(outer: float = 0.5, inner: float = 0.4, floor: float = 0.1, bottom: bool
 
 @pytest.mark.medium
 def test_vessels_and_nothing_else_are_found_among_the_bundled_objects() -> None:
-    assert {name for name in list_objects() if interior(load_object(name)) is not None} == VESSELS
+    assert {name for name in list_objects() if find_interior(load_object(name)) is not None} == VESSELS
 
 
 def test_the_inside_of_a_turned_cup_is_that_of_its_profile() -> None:
-    found = interior(cup())
+    found = find_interior(cup())
     assert found is not None
     np.testing.assert_allclose(found.axis, 0.0, atol=0.005)
     assert float(found.heights[0]) == pytest.approx(0.1, abs=1e-6)
-    assert float(found.heights[-1]) == pytest.approx(0.1 + BRIM * 0.9, abs=1e-6)
+    assert float(found.heights[-1]) == pytest.approx(0.1 + FILL_LIMIT * 0.9, abs=1e-6)
     np.testing.assert_allclose(found.radii, 0.4, atol=0.002)
 
 
 def test_a_pipe_holds_nothing() -> None:
-    assert interior(cup(bottom=False)) is None
+    assert find_interior(cup(bottom=False)) is None
 
 
 @pytest.mark.parametrize("name", ["mug", "bowl", "wine-glass"])
 def test_the_liquid_stays_inside_the_vessel(name: str) -> None:
     """Level rays from the axis at the surface's height are not stopped before the surface ends, and soon after."""
     asset = load_object(name)
-    found = interior(asset)
+    found = find_interior(asset)
     assert found is not None
-    filled = bound(describe(name), level=[0, 1])
+    filled = bound(load_description(name), level=[0, 1])
     for level in (0.3, 0.77):
         disc = surface(filled, level)
         reach = np.linalg.norm(disc[1:, :2] - found.axis, axis=1)
@@ -97,7 +97,7 @@ def surface(filled: ContentsControl, level: float) -> np.ndarray:
 
 
 def test_the_level_runs_from_the_floor_to_the_brim(scene: SceneDescription) -> None:
-    found = interior(scene.object)
+    found = find_interior(scene.object)
     assert found is not None
     filled = bound(scene, level=[0, 1])
     heights = [surface(filled, level) for level in (0.0, 0.5, 1.0)]
@@ -141,14 +141,14 @@ def test_proportions_add_up_to_one_within_their_ranges(scene: SceneDescription, 
         said = filled.describe(u)
         shares = {name: float(said[f"contents.{name}"]["value"]) for name in INGREDIENTS}
         assert sum(shares.values()) == pytest.approx(1.0, abs=1e-6)
-        for name, (low, high) in filled.bounds.items():
+        for name, (low, high) in filled.proportion_bounds.items():
             assert low - 1e-6 <= shares[name] <= high + 1e-6
 
 
 def test_two_coordinates_reach_every_mixture(scene: SceneDescription) -> None:
     filled = bound(scene)
     assert [group.parameter for group in filled.groups] == ["level", "water", "milk"]
-    cuts = filled.cuts({"water": 0.2, "milk": 0.5, "coffee": 0.3})
+    cuts = filled.find_cuts({"water": 0.2, "milk": 0.5, "coffee": 0.3})
     shares = filled.values(torch.tensor([0.5, cuts["water"], cuts["milk"]]))
     assert [float(shares[name]) for name in INGREDIENTS] == pytest.approx([0.2, 0.5, 0.3], abs=1e-6)
     assert [float(filled.values(filled.start)[name]) for name in INGREDIENTS] == [0.0, 0.0, 1.0]
@@ -182,7 +182,7 @@ def test_other_bad_settings_are_explained(scene: SceneDescription) -> None:
     with pytest.raises(InputError, match=r"contents\.milk: expected a number or a range"):
         ContentsControl(milk={"choices": [0, 0.5]})
     with pytest.raises(InputError, match=r"expected a vessel, open at the top .*, got 'banana'"):
-        ContentsControl().prepare(describe("banana"))
+        ContentsControl().prepare(load_description("banana"))
     upside_down = replace(
         scene.object, name="hat", mesh=replace(scene.object.mesh, vertices=-scene.object.mesh.vertices)
     )
@@ -195,18 +195,18 @@ def test_other_bad_settings_are_explained(scene: SceneDescription) -> None:
 
 def test_liquids_have_their_colours() -> None:
     vessel = torch.tensor([0.5, 0.1, 0.1])
-    water, milk, coffee = (liquid(torch.eye(3)[number], vessel) for number in range(3))
+    water, milk, coffee = (mix_liquid_color(torch.eye(3)[number], vessel) for number in range(3))
     assert float(coffee.max()) < 0.06 and float(coffee[0]) > 1.5 * float(coffee[2])
     assert float(milk.min()) > 0.65
     assert bool((water < vessel).all()) and bool((water > 0.8 * vessel).all())
-    latte = liquid(torch.tensor([0.0, 0.5, 0.5]), vessel)
+    latte = mix_liquid_color(torch.tensor([0.0, 0.5, 0.5]), vessel)
     assert bool((latte > coffee).all() & (latte < milk).all()) and float(latte[0]) > 1.5 * float(latte[2])
 
 
 @pytest.mark.parametrize("corner", range(8))
 def test_the_colour_has_finite_derivatives_everywhere(corner: int) -> None:
     shares = torch.tensor([float(corner >> bit & 1) for bit in range(3)], requires_grad=True)
-    liquid(shares, torch.tensor([0.0, 0.5, 1.0])).sum().backward()
+    mix_liquid_color(shares, torch.tensor([0.0, 0.5, 1.0])).sum().backward()
     assert shares.grad is not None and bool(torch.isfinite(shares.grad).all())
 
 

@@ -15,19 +15,25 @@ from scipy import stats
 from torch import Tensor
 
 from advsearch.controls import corruption, make_space
-from advsearch.controls.corruption import NAMES, STEPPED, CorruptionControl, corrupted, filters
-from advsearch.controls.corruption.filters import blurred, fractal, poisson
+from advsearch.controls.corruption import (
+    CORRUPTION_NAMES,
+    STEPPED_CORRUPTIONS,
+    CorruptionControl,
+    apply_corruption,
+    filters,
+)
+from advsearch.controls.corruption.filters import blur_gaussian, make_fractal_noise, sample_poisson
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 
-every_corruption = pytest.mark.parametrize("which", NAMES)
+every_corruption = pytest.mark.parametrize("which", CORRUPTION_NAMES)
 DRAWN = ("shot_noise", "impulse_noise")
 """Their derivative is one of the average over draws."""
 
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 @pytest.fixture(autouse=True)
@@ -57,12 +63,12 @@ def distance(one: Tensor, other: Tensor) -> float:
 @every_corruption
 def test_severity_0_is_the_picture_and_5_is_far_from_it(which: str) -> None:
     image = scenery()
-    assert float((corrupted(image, which, number(0.0)) - image).abs().max()) < 1e-5
-    distances = [distance(corrupted(image, which, number(severity)), image) for severity in (0.4, 1.0, 5.0)]
+    assert float((apply_corruption(image, which, number(0.0)) - image).abs().max()) < 1e-5
+    distances = [distance(apply_corruption(image, which, number(severity)), image) for severity in (0.4, 1.0, 5.0)]
     assert distances[2] > 0.003 and (which == "pixelate" or distances[1] > 0.0)
-    if which not in STEPPED:
+    if which not in STEPPED_CORRUPTIONS:
         assert distances[0] < distances[1]
-    if which not in ("elastic", "frost", *STEPPED):
+    if which not in ("elastic", "frost", *STEPPED_CORRUPTIONS):
         assert distances[1] < distances[2]
 
 
@@ -74,7 +80,7 @@ def test_extreme_pictures_give_finite_pictures_and_derivatives(which: str) -> No
     for picture in pictures:
         for severity in (0.0, 0.5, 1.0, 2.5, 5.0):
             image, at = picture.clone().requires_grad_(), torch.tensor(severity, requires_grad=True)
-            seen = corrupted(image, which, at)
+            seen = apply_corruption(image, which, at)
             seen.sum().backward()
             assert (
                 seen.shape == picture.shape and float(seen.detach().min()) >= 0.0 and float(seen.detach().max()) <= 1.0
@@ -83,7 +89,7 @@ def test_extreme_pictures_give_finite_pictures_and_derivatives(which: str) -> No
             assert bool(torch.isfinite(image.grad).all()) and math.isfinite(float(at.grad))
 
 
-@pytest.mark.parametrize("which", [name for name in NAMES if name not in (*DRAWN, *STEPPED)])
+@pytest.mark.parametrize("which", [name for name in CORRUPTION_NAMES if name not in (*DRAWN, *STEPPED_CORRUPTIONS)])
 def test_the_derivatives_are_those_of_differences(which: str) -> None:
     image = scenery()
     image[5, 7] = 0.95  # one brightest pixel, which fog takes as its measure
@@ -92,12 +98,12 @@ def test_the_derivatives_are_those_of_differences(which: str) -> None:
     direction = 0.0005 * torch.sin(11.0 * rows + image.flip(1) * 6.0)
 
     def change(by_picture: Tensor, by_severity: float) -> Tensor:
-        ahead = corrupted(image + by_picture, which, number(severity + by_severity))
-        return (ahead - corrupted(image - by_picture, which, number(severity - by_severity))) * weights / 2.0
+        ahead = apply_corruption(image + by_picture, which, number(severity + by_severity))
+        return (ahead - apply_corruption(image - by_picture, which, number(severity - by_severity))) * weights / 2.0
 
     for severity in (0.5, 1.7, 3.4):
         at, picture = torch.tensor(severity, requires_grad=True), image.clone().requires_grad_()
-        (corrupted(picture, which, at) * weights).sum().backward()
+        (apply_corruption(picture, which, at) * weights).sum().backward()
         assert at.grad is not None and picture.grad is not None
         moved = change(torch.zeros(()), 0.004) / 0.004
         assert float(at.grad) == pytest.approx(
@@ -110,13 +116,13 @@ def test_the_derivatives_are_those_of_differences(which: str) -> None:
 
 def test_the_start_has_a_slope_for_every_corruption() -> None:
     image = scenery()
-    for which in NAMES:
+    for which in CORRUPTION_NAMES:
         at = torch.tensor(0.0, requires_grad=True)
-        (corrupted(image, which, at) - image).pow(2).sum().backward()
+        (apply_corruption(image, which, at) - image).pow(2).sum().backward()
         assert float(at.grad or 0.0) == pytest.approx(0.0, abs=1e-4), "no difference yet, so no slope of its square"
         at = torch.tensor(0.0, requires_grad=True)
-        weights = (corrupted(image, which, number(1.0)) - image).sign()
-        (corrupted(image, which, at) * weights).sum().backward()
+        weights = (apply_corruption(image, which, number(1.0)) - image).sign()
+        (apply_corruption(image, which, at) * weights).sum().backward()
         assert at.grad is not None and (which == "pixelate" or float(at.grad) > 0.0), which
 
 
@@ -132,7 +138,7 @@ def test_the_noises_are_as_strong_as_published(whole: int) -> None:
     assert float(raw.std()) == pytest.approx(math.sqrt(0.5 / photons), rel=0.02)
     assert float(((raw * photons) - (raw * photons).round()).abs().max()) < 1e-3, "whole photons"
     (lost,) = filters.IMPULSE[whole - 1]
-    seen = corrupted(image, "impulse_noise", severity)
+    seen = apply_corruption(image, "impulse_noise", severity)
     assert float((seen != 0.5).float().mean()) == pytest.approx(lost, rel=0.05)
     assert float((seen == 1.0).float().mean()) == pytest.approx(lost / 2.0, rel=0.1)
 
@@ -141,14 +147,14 @@ def test_poisson_numbers_are_those_of_the_distribution() -> None:
     generator = torch.Generator().manual_seed(3)
     mean, share = torch.rand(500, generator=generator) * 60.0, torch.rand(500, generator=generator)
     expected = stats.poisson.ppf(share.double().numpy(), mean.double().numpy())
-    assert np.array_equal(poisson(mean, share).numpy(), expected.astype(np.float32))
-    assert float(poisson(torch.zeros(9), torch.linspace(0.0, 0.9999, 9)).max()) == 0.0
+    assert np.array_equal(sample_poisson(mean, share).numpy(), expected.astype(np.float32))
+    assert float(sample_poisson(torch.zeros(9), torch.linspace(0.0, 0.9999, 9)).max()) == 0.0
 
 
 def test_impulse_noise_has_the_slope_of_its_average() -> None:
     image, weights = scenery(), scenery().flip(0) - 0.5
     at = torch.tensor(3.5, requires_grad=True)
-    (corrupted(image, "impulse_noise", at) * weights).sum().backward()
+    (apply_corruption(image, "impulse_noise", at) * weights).sum().backward()
     gain = filters.IMPULSE[3][0] - filters.IMPULSE[2][0]
     assert at.grad is not None
     assert float(at.grad) == pytest.approx(float((gain * (0.5 - image) * weights).sum()), abs=4.0)
@@ -158,7 +164,7 @@ def test_impulse_noise_has_the_slope_of_its_average() -> None:
 def test_lengths_grow_with_the_picture(side: int, sigma: float) -> None:
     point = torch.zeros(side, side, 3)
     point[side // 2, side // 2] = 1.0
-    seen = corrupted(point, "gaussian_blur", number(3.0))[..., 0]
+    seen = apply_corruption(point, "gaussian_blur", number(3.0))[..., 0]
     offsets = torch.arange(side) - side // 2
     assert float(seen.sum()) == pytest.approx(1.0, abs=1e-4)
     assert float((seen.sum(dim=0) * offsets**2).sum()) == pytest.approx(sigma**2, rel=0.02)
@@ -167,7 +173,7 @@ def test_lengths_grow_with_the_picture(side: int, sigma: float) -> None:
 def test_a_point_out_of_focus_is_a_disc() -> None:
     point = torch.zeros(224, 224, 3)
     point[100, 100] = 1.0
-    seen = corrupted(point, "defocus_blur", number(5.0))[..., 0] * math.pi * 10.0**2
+    seen = apply_corruption(point, "defocus_blur", number(5.0))[..., 0] * math.pi * 10.0**2
     for inside in (seen[100, 100], seen[100, 109], seen[109, 100]):
         assert float(inside) == pytest.approx(1.0, abs=0.05)
     assert float(seen[100, 111].abs()) < 1e-3 and float(seen[108, 108].abs()) < 1e-3
@@ -176,8 +182,8 @@ def test_a_point_out_of_focus_is_a_disc() -> None:
 def test_blurs_keep_a_flat_picture_and_its_mean() -> None:
     flat = torch.full((40, 50, 3), 0.3)
     for which in ("defocus_blur", "glass_blur", "motion_blur", "zoom_blur", "gaussian_blur", "elastic", "pixelate"):
-        assert float((corrupted(flat, which, number(4.0)) - flat).abs().max()) < 1e-5, which
-    assert blurred(flat, number(0.01)).allclose(flat)
+        assert float((apply_corruption(flat, which, number(4.0)) - flat).abs().max()) < 1e-5, which
+    assert blur_gaussian(flat, number(0.01)).allclose(flat)
 
 
 def test_contrast_brightness_and_saturation_do_as_published() -> None:
@@ -186,7 +192,7 @@ def test_contrast_brightness_and_saturation_do_as_published() -> None:
     torch.testing.assert_close(flat.std(dim=(0, 1)), 0.3 * image.std(dim=(0, 1)))
     bright = corruption.brightness(image, number(1.0), 0)
     torch.testing.assert_close(bright.amax(-1), (image.amax(-1) + 0.1).clamp(max=1.0))
-    black = corrupted(torch.zeros(4, 4, 3), "brightness", number(3.0))
+    black = apply_corruption(torch.zeros(4, 4, 3), "brightness", number(3.0))
     torch.testing.assert_close(black, torch.full((4, 4, 3), 0.3))
     grey = corruption.saturate(image, number(2.0), 0)
     spread = (image.amax(-1) - image.amin(-1)).mean()
@@ -196,7 +202,7 @@ def test_contrast_brightness_and_saturation_do_as_published() -> None:
 
 def test_jpeg_is_what_a_file_would_be_and_passes_derivatives_through() -> None:
     image = ((scenery() * 255.0).round() / 255.0).requires_grad_()
-    seen = corrupted(image, "jpeg", number(4.0))
+    seen = apply_corruption(image, "jpeg", number(4.0))
     file = io.BytesIO()
     Image.fromarray((image.detach() * 255.0).round().to(torch.uint8).numpy()).save(file, "JPEG", quality=10)
     expected = torch.from_numpy(np.asarray(Image.open(file)).astype(np.float32) / 255.0)
@@ -208,32 +214,32 @@ def test_jpeg_is_what_a_file_would_be_and_passes_derivatives_through() -> None:
 def test_pixelate_averages_over_cells() -> None:
     image = torch.rand(224, 224, 3, generator=torch.Generator().manual_seed(5))
     cells = image.reshape(56, 4, 56, 4, 3).mean(dim=(1, 3))
-    seen = corrupted(image, "pixelate", number(5.0))
+    seen = apply_corruption(image, "pixelate", number(5.0))
     torch.testing.assert_close(seen, cells.repeat_interleave(4, 0).repeat_interleave(4, 1), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("which", STEPPED)
+@pytest.mark.parametrize("which", STEPPED_CORRUPTIONS)
 def test_stepped_corruptions_round_the_severity_and_slope_between_the_steps(which: str) -> None:
     image = scenery(96, 96)
     at = torch.tensor(2.3, requires_grad=True)
-    seen = corrupted(image, which, at)
-    assert torch.equal(seen.detach(), corrupted(image, which, number(2.0)))
-    assert not torch.equal(seen.detach(), corrupted(image, which, number(2.5)))
+    seen = apply_corruption(image, which, at)
+    assert torch.equal(seen.detach(), apply_corruption(image, which, number(2.0)))
+    assert not torch.equal(seen.detach(), apply_corruption(image, which, number(2.5)))
     seen.sum().backward()
-    step = corrupted(image, which, number(3.0)) - corrupted(image, which, number(2.0))
+    step = apply_corruption(image, which, number(3.0)) - apply_corruption(image, which, number(2.0))
     assert at.grad is not None and float(at.grad) == pytest.approx(float(step.sum()), abs=0.05)
 
 
 @pytest.mark.parametrize("which", ["gaussian_noise", "glass_blur", "snow", "frost", "fog", "motion_blur", "elastic"])
 def test_the_seed_chooses_the_draw(which: str) -> None:
     image = scenery()
-    first = corrupted(image, which, number(2.0), seed=1)
-    assert torch.equal(first, corrupted(image, which, number(2.0), seed=1))
-    assert distance(first, corrupted(image, which, number(2.0), seed=2)) > 1e-3
+    first = apply_corruption(image, which, number(2.0), seed=1)
+    assert torch.equal(first, apply_corruption(image, which, number(2.0), seed=1))
+    assert distance(first, apply_corruption(image, which, number(2.0), seed=2)) > 1e-3
 
 
 def test_fractal_noise_fills_its_range_and_wraps_around() -> None:
-    field = fractal(64, 2.0, torch.Generator().manual_seed(0))
+    field = make_fractal_noise(64, 2.0, torch.Generator().manual_seed(0))
     assert field.shape == (64, 64) and float(field.min()) == 0.0 and float(field.max()) == 1.0
     jumps = (field - field.roll(1, 0)).abs()
     assert float(jumps[0].max()) < 2.0 * float(jumps[1:].max())
@@ -254,10 +260,10 @@ def groups(scene: SceneDescription, **settings: Any) -> dict[str, tuple[int, tup
 
 def test_what_is_not_fixed_is_searched(scene: SceneDescription) -> None:
     image = ("image",)
-    assert groups(scene) == {"which": (len(NAMES), ()), "severity": (0, image)}
+    assert groups(scene) == {"which": (len(CORRUPTION_NAMES), ()), "severity": (0, image)}
     assert groups(scene, which=["fog", "snow"]) == {"which": (2, ()), "severity": (0, image)}
-    assert groups(scene, severity=[1, 5]) == {"which": (len(NAMES), ()), "severity": (0, image)}
-    assert groups(scene, severity=3) == {"which": (len(NAMES), ())}
+    assert groups(scene, severity=[1, 5]) == {"which": (len(CORRUPTION_NAMES), ()), "severity": (0, image)}
+    assert groups(scene, severity=3) == {"which": (len(CORRUPTION_NAMES), ())}
     assert groups(scene, which="fog") == {"severity": (0, image)}
     assert groups(scene, which="jpeg") == {"severity": (0, ())}, "a whole severity has no derivative"
     with pytest.raises(InputError, match="every parameter is fixed"):
@@ -267,9 +273,9 @@ def test_what_is_not_fixed_is_searched(scene: SceneDescription) -> None:
 def test_a_bound_control_corrupts_the_picture_and_says_how(scene: SceneDescription) -> None:
     bound = CorruptionControl(which=["contrast", "jpeg"], seed=7).bind(scene)
     image = scenery()
-    assert torch.equal(bound.picture(bound.start, image), image)
+    assert torch.equal(bound.apply_to_image(bound.start, image), image)
     u = torch.tensor([0.9, 0.46], requires_grad=True)
-    assert torch.equal(bound.picture(u, image).detach(), corrupted(image, "jpeg", number(2.0)))
+    assert torch.equal(bound.apply_to_image(u, image).detach(), apply_corruption(image, "jpeg", number(2.0)))
     said = bound.describe(u)
     assert said["corruption.which"] == {"value": "jpeg", "unit": "name"}
     assert said["corruption.severity"]["value"] == pytest.approx(2.3)

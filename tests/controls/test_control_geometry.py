@@ -13,10 +13,16 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import make_control
-from advsearch.controls.geometry import WALL_STRAIN, GeometryControl, Limits, body, shape_modes
+from advsearch.controls.geometry import (
+    MAX_WALL_STRAIN,
+    DisplacementLimits,
+    GeometryControl,
+    compute_shape_modes,
+    get_welded_mesh,
+)
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 
 OFFSETS = "object.offsets"
 
@@ -25,7 +31,7 @@ FORMS = ("modes", "large-steps")
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 def bound(scene: SceneDescription, **settings: Any) -> GeometryControl:
@@ -62,16 +68,16 @@ def test_it_starts_with_the_shape_as_it_is(scene: SceneDescription, form: str) -
 @pytest.mark.parametrize("epsilon", [0.03, 0.3])
 @pytest.mark.parametrize("name", ["mug", "wine-glass", "book"])
 def test_no_configuration_breaks_the_mesh(name: str, epsilon: float, form: str) -> None:
-    scene = describe(name)
-    control, solid = bound(scene, form=form, epsilon=epsilon), body(scene.object.mesh)
-    places = torch.from_numpy(solid.places)
+    scene = load_description(name)
+    control, solid = bound(scene, form=form, epsilon=epsilon), get_welded_mesh(scene.object.mesh)
+    places = torch.from_numpy(solid.positions)
     before = face_normals(places, solid.faces)
     for u in wild(len(control.start)):
-        offsets = control.offsets(u)
+        offsets = control.compute_offsets(u)
         assert float(offsets.norm(dim=1).max()) < epsilon
         assert float((before * face_normals(places + offsets, solid.faces)).sum(dim=1).min()) > 0.0
         said = control.describe(u)
-        assert said["geometry.thinnest"]["value"] > 1.0 - WALL_STRAIN  # type: ignore[operator]
+        assert said["geometry.thinnest"]["value"] > 1.0 - MAX_WALL_STRAIN  # type: ignore[operator]
 
 
 def test_the_whole_displacement_is_used(scene: SceneDescription) -> None:
@@ -85,12 +91,12 @@ def test_the_whole_displacement_is_used(scene: SceneDescription) -> None:
 
 def test_both_sides_of_a_wall_move_together(scene: SceneDescription) -> None:
     """The mug's wall is 0.03 thick; 24 modes at a largest displacement of 0.03 leave it so within a tenth."""
-    control, solid = bound(scene, epsilon=0.03), body(scene.object.mesh)
-    gaps = np.linalg.norm(solid.places[solid.walls[:, 0]] - solid.places[solid.walls[:, 1]], axis=1)
+    control, solid = bound(scene, epsilon=0.03), get_welded_mesh(scene.object.mesh)
+    gaps = np.linalg.norm(solid.positions[solid.walls[:, 0]] - solid.positions[solid.walls[:, 1]], axis=1)
     thin = torch.from_numpy(solid.walls[gaps < 0.05])
     assert len(thin) > 500
     for u in wild(len(control.start)):
-        offsets = control.offsets(u)
+        offsets = control.compute_offsets(u)
         apart = (offsets[thin[:, 0]] - offsets[thin[:, 1]]).norm(dim=1).max()
         assert float(apart) < 0.1 * float(offsets.norm(dim=1).max()) + 1e-9 or float(apart) < 0.004
 
@@ -98,7 +104,7 @@ def test_both_sides_of_a_wall_move_together(scene: SceneDescription) -> None:
 def test_vertices_that_a_seam_splits_stay_together(scene: SceneDescription) -> None:
     mesh, control = scene.object.mesh, bound(scene, form="large-steps")
     offsets = control.inputs(torch.rand(control.start.shape, generator=torch.Generator().manual_seed(3)))[OFFSETS]
-    index = body(mesh).index
+    index = get_welded_mesh(mesh).position_of_vertex
     first = np.unique(index, return_index=True)[1]
     assert len(first) < len(mesh.vertices)
     assert torch.equal(offsets, offsets[torch.from_numpy(first[index])])
@@ -106,8 +112,8 @@ def test_vertices_that_a_seam_splits_stay_together(scene: SceneDescription) -> N
 
 @pytest.mark.parametrize("form", FORMS)
 def test_no_rigid_motion_is_left(scene: SceneDescription, form: str) -> None:
-    control, solid = bound(scene, form=form), body(scene.object.mesh)
-    centred = solid.places - solid.places.mean(axis=0)
+    control, solid = bound(scene, form=form), get_welded_mesh(scene.object.mesh)
+    centred = solid.positions - solid.positions.mean(axis=0)
     for u in wild(len(control.start))[:3]:
         field = control._field(2.0 * u.double() - 1.0).numpy()
         size = float(np.linalg.norm(field))
@@ -118,27 +124,27 @@ def test_no_rigid_motion_is_left(scene: SceneDescription, form: str) -> None:
 
 def test_modes_are_kept_in_memory_and_come_smoothest_first(scene: SceneDescription) -> None:
     mesh = scene.object.mesh
-    modes = shape_modes(mesh, 24)
-    assert modes is shape_modes(mesh, 24)
+    modes = compute_shape_modes(mesh, 24)
+    assert modes is compute_shape_modes(mesh, 24)
     np.testing.assert_allclose(np.linalg.norm(modes, axis=1).max(axis=0), 1.0)
-    places, faces = body(mesh).places, body(mesh).faces
+    places, faces = get_welded_mesh(mesh).positions, get_welded_mesh(mesh).faces
     edges = np.linalg.norm(places[faces[:, 0]] - places[faces[:, 1]], axis=1)
     rises = np.linalg.norm(modes[faces[:, 0]] - modes[faces[:, 1]], axis=1) / edges[:, None]
     slopes = np.sqrt((rises**2).mean(axis=0))
     assert slopes[:4].mean() < 0.7 * slopes[-4:].mean()
-    fewer = shape_modes(mesh, 3)
+    fewer = compute_shape_modes(mesh, 3)
     assert fewer.shape[2] == 3
 
 
 def test_the_derivative_of_the_limits_is_exact(scene: SceneDescription) -> None:
-    solid = body(scene.object.mesh)
-    limits = Limits(solid, 0.2)
+    solid = get_welded_mesh(scene.object.mesh)
+    limits = DisplacementLimits(solid, 0.2)
     generator = torch.Generator().manual_seed(5)
-    modes = torch.from_numpy(shape_modes(scene.object.mesh, 4))
+    modes = torch.from_numpy(compute_shape_modes(scene.object.mesh, 4))
     weights = torch.randn(modes.shape[:2], generator=generator, dtype=torch.float64)
 
     def total(amplitudes: Tensor) -> Tensor:
-        return (limits.held(modes @ amplitudes) * weights).sum()
+        return (limits.limit(modes @ amplitudes) * weights).sum()
 
     for scale in (0.01, 1.0, 30.0):
         at = scale * torch.randn(4, generator=generator, dtype=torch.float64)
@@ -197,7 +203,7 @@ def test_coarse_and_unconnected_meshes_are_taken(scene: SceneDescription, form: 
 def test_the_mesh_is_kept_as_a_file(scene: SceneDescription) -> None:
     control = bound(scene, epsilon=0.1)
     u = wild(len(control.start))[1]
-    files = control.files(u)
+    files = control.get_artifact_files(u)
     (name,) = files
     assert name == "geometry.obj"
     read = trimesh.load(io.BytesIO(files[name]), file_type="obj", process=False, maintain_order=True)
@@ -209,7 +215,7 @@ def test_the_mesh_is_kept_as_a_file(scene: SceneDescription) -> None:
 
 def test_settings_make_the_same_control_again() -> None:
     control = GeometryControl(epsilon=0.1, modes=7, name="dent")
-    assert make_control("dent", control.settings()).settings() == control.settings()
+    assert make_control("dent", control.to_settings()).to_settings() == control.to_settings()
     assert make_control("geometry.pushes").form == "large-steps"  # type: ignore[attr-defined]
 
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls.haze import LEAST_RADIUS, THIN_HAZE, HazeControl
+from advsearch.controls.haze import DEFAULT_DENSITY, MIN_RADIUS, HazeControl
 from advsearch.errors import InputError
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.parts import HazePart
@@ -25,7 +25,7 @@ WHITE = [1.0, 1.0, 1.0]
 
 @cache
 def plain() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 @cache
@@ -40,7 +40,10 @@ def haze(density: float, albedo: list[float]) -> dict[str, Tensor]:
 @pytest.mark.medium
 def test_density_0_is_the_scene_without_haze() -> None:
     without = MitsubaScene(plain(), (SIDE, SIDE))
-    pairs = [(without.radiance({}, seed, 256), hazy().radiance(haze(0.0, WHITE), seed, 256)) for seed in range(4)]
+    pairs = [
+        (without.render_radiance({}, seed, 256), hazy().render_radiance(haze(0.0, WHITE), seed, 256))
+        for seed in range(4)
+    ]
     clear, seen = (torch.stack(one).mean(0) for one in zip(*pairs, strict=True))
     assert float(seen.mean()) == pytest.approx(float(clear.mean()), rel=0.005)
     spread = float((pairs[0][0] - pairs[1][0]).square().mean().sqrt()) / 2.0  # of a mean of four
@@ -51,11 +54,11 @@ def test_density_0_is_the_scene_without_haze() -> None:
 def test_black_haze_takes_light_out_as_beer_and_lambert_say() -> None:
     """An environment of radiance 1 seen past the object: exp(-density * length through the ball)."""
     white = EnvironmentAsset("white", np.ones((8, 16, 3), np.float32))
-    scene = replace(describe("mug", given={"ground.size": 0.0}), environment=white)
+    scene = replace(load_description("mug", given={"ground.size": 0.0}), environment=white)
     prepared = HazeControl().prepare(scene)
     (part,) = prepared.parts
     assert isinstance(part, HazePart)
-    seen = MitsubaScene(prepared, (SIDE, SIDE)).radiance(haze(0.2, [0.0, 0.0, 0.0]), 0, 1024)
+    seen = MitsubaScene(prepared, (SIDE, SIDE)).render_radiance(haze(0.2, [0.0, 0.0, 0.0]), 0, 1024)
     camera = camera_to_world(scene)
     half = math.tan(math.radians(17.5))
     towards = camera[:3, :3] @ np.array([half * (1.0 - 1.0 / SIDE), half * (1.0 - 1.0 / SIDE), 1.0])
@@ -68,15 +71,15 @@ def test_black_haze_takes_light_out_as_beer_and_lambert_say() -> None:
 def test_white_haze_under_even_light_stays_white() -> None:
     """The furnace test: an object that reflects nearly all light disappears, and nothing gets darker."""
     white = EnvironmentAsset("white", np.ones((8, 16, 3), np.float32))
-    scene = replace(describe("mug", given={"ground.size": 0.0, "pose.scale": 0.01}), environment=white)
+    scene = replace(load_description("mug", given={"ground.size": 0.0, "pose.scale": 0.01}), environment=white)
     furnace = MitsubaScene(HazeControl().prepare(scene), (SIDE, SIDE))
-    assert float(furnace.radiance(haze(0.15, WHITE), 0, 64).mean()) == pytest.approx(1.0, abs=0.01)
-    assert float(furnace.radiance(haze(0.3, WHITE), 0, 64).mean()) == pytest.approx(0.985, abs=0.02)
+    assert float(furnace.render_radiance(haze(0.15, WHITE), 0, 64).mean()) == pytest.approx(1.0, abs=0.01)
+    assert float(furnace.render_radiance(haze(0.3, WHITE), 0, 64).mean()) == pytest.approx(0.985, abs=0.02)
 
 
 @pytest.mark.medium
 def test_dense_white_haze_hides_the_object() -> None:
-    contrasts = [float(hazy().radiance(haze(density, WHITE), 0, 256).std()) for density in (0.0, 0.1, 0.3)]
+    contrasts = [float(hazy().render_radiance(haze(density, WHITE), 0, 256).std()) for density in (0.0, 0.1, 0.3)]
     assert contrasts[0] > 1.3 * contrasts[1] > 1.5 * contrasts[2]
 
 
@@ -91,11 +94,11 @@ def test_dense_white_haze_hides_the_object() -> None:
 def test_the_adjoint_agrees_with_differences(density: float, steps: dict[str, tuple[float, float]]) -> None:
     """Density, colour, and the object's base colour seen through the haze."""
     weights = torch.linspace(0.5, 1.0, SIDE)[:, None, None].expand(SIDE, SIDE, 3).contiguous()
-    inputs = {**haze(density, [0.9, 0.6, 0.3]), "object.base_color": hazy().base("object.base_color")}
-    found = {name: float(one.sum()) for name, one in hazy().adjoint(inputs, weights, 5, 256).items()}
+    inputs = {**haze(density, [0.9, 0.6, 0.3]), "object.base_color": hazy().get_base_value("object.base_color")}
+    found = {name: float(one.sum()) for name, one in hazy().render_adjoint(inputs, weights, 5, 256).items()}
     for name, (step, tolerance) in steps.items():
         above, below = (
-            float((hazy().radiance({**inputs, name: inputs[name] + way * step}, 5, 256) * weights).sum())
+            float((hazy().render_radiance({**inputs, name: inputs[name] + way * step}, 5, 256) * weights).sum())
             for way in (1.0, -1.0)
         )
         assert found[name] == pytest.approx((above - below) / (2.0 * step), rel=tolerance), name
@@ -114,23 +117,23 @@ def test_it_starts_without_haze_unless_its_density_is_not_searched() -> None:
         return float(bound.inputs(bound.start)["haze.density"])
 
     assert density(HazeControl()) == 0.0
-    assert density(HazeControl(red=[0.5, 1])) == pytest.approx(THIN_HAZE)
+    assert density(HazeControl(red=[0.5, 1])) == pytest.approx(DEFAULT_DENSITY)
     assert density(HazeControl(red=[0.5, 1], density=0.4)) == pytest.approx(0.4)
 
 
 def test_camera_and_object_are_inside() -> None:
     (part,) = HazeControl().prepare(plain()).parts
     assert isinstance(part, HazePart)
-    assert part.radius >= max(LEAST_RADIUS, 1.4 * float(np.linalg.norm(camera_to_world(plain())[:3, 3])))
-    (far,) = HazeControl().prepare(describe("mug", size=1.0, given={"camera.distance": 20.0})).parts
+    assert part.radius >= max(MIN_RADIUS, 1.4 * float(np.linalg.norm(camera_to_world(plain())[:3, 3])))
+    (far,) = HazeControl().prepare(load_description("mug", size=1.0, given={"camera.distance": 20.0})).parts
     assert isinstance(far, HazePart) and far.radius > 28.0
 
 
 @pytest.mark.parametrize(("density", "albedo"), [(2.0, WHITE), (2.0, [0.0, 0.0, 0.0]), (1e-6, WHITE), (0.0, WHITE)])
 def test_extreme_haze_is_finite_and_so_are_its_derivatives(density: float, albedo: list[float]) -> None:
     inputs = haze(density, albedo)
-    assert bool(torch.isfinite(hazy().radiance(inputs, 0, 16)).all())
-    found = hazy().adjoint(inputs, torch.ones(SIDE, SIDE, 3), 0, 16)
+    assert bool(torch.isfinite(hazy().render_radiance(inputs, 0, 16)).all())
+    found = hazy().render_adjoint(inputs, torch.ones(SIDE, SIDE, 3), 0, 16)
     assert all(bool(torch.isfinite(one).all()) for one in found.values())
 
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls.light import LIT_POWER, LightControl, metered_irradiance
+from advsearch.controls.light import DEFAULT_POWER, LightControl, compute_metered_irradiance
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 
@@ -26,13 +26,13 @@ ROUNDING = 0.002
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 def rendered(control: LightControl, scene: SceneDescription, u: list[float], spp: int = 64, seed: int = 0) -> Tensor:
     prepared = control.prepare(scene)
     bound = control.bind(prepared)
-    return MitsubaScene(prepared, (SIDE, SIDE)).radiance(bound.inputs(torch.tensor(u)), seed, spp)
+    return MitsubaScene(prepared, (SIDE, SIDE)).render_radiance(bound.inputs(torch.tensor(u)), seed, spp)
 
 
 def pixel_of(point: np.ndarray, scene: SceneDescription) -> tuple[int, int]:
@@ -44,19 +44,21 @@ def pixel_of(point: np.ndarray, scene: SceneDescription) -> tuple[int, int]:
 
 
 def test_the_unit_of_power_shows_a_white_surface_just_below_white(scene: SceneDescription) -> None:
-    assert metered_irradiance(scene) / math.pi * 0.8 * scene.gain == pytest.approx(0.9)
+    assert compute_metered_irradiance(scene) / math.pi * 0.8 * scene.gain == pytest.approx(0.9)
 
 
 @pytest.mark.parametrize("type", ["area", "point"])
 def test_a_lamp_puts_its_power_over_the_squared_distance_on_what_faces_it(type: str) -> None:
     """White ground below a lamp in the dark: radiance = albedo E / pi / d^2 for each channel."""
-    scene = describe("mug", DARK, given={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0})
+    scene = load_description(
+        "mug", DARK, given={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0}
+    )
     settings: dict[str, Any] = {"size": 0.05} if type == "area" else {}
     control = LightControl(type=type, x=[0, 1], y=0, z=2, red=1, green=0.5, blue=0, power=3, **settings)
     seen = rendered(control, scene, [0.0], spp=256)
     row, column = pixel_of(np.zeros(3), scene)
     under = seen[row - 1 : row + 3, column - 2 : column + 2].mean(dim=(0, 1))
-    expected = 3.0 / 4.0 * metered_irradiance(scene) / math.pi * srgb_to_linear(torch.tensor([1.0, 0.5, 0.0]))
+    expected = 3.0 / 4.0 * compute_metered_irradiance(scene) / math.pi * srgb_to_linear(torch.tensor([1.0, 0.5, 0.0]))
     assert torch.allclose(under, expected, rtol=0.05, atol=1e-6)
 
 
@@ -76,7 +78,7 @@ def test_it_starts_dark_unless_its_power_is_not_searched(scene: SceneDescription
 
     assert power() == 0.0
     assert power(power=[1, 50]) == 1.0
-    assert power(x=[-1, 1]) == LIT_POWER
+    assert power(x=[-1, 1]) == DEFAULT_POWER
     assert power(x=[-1, 1], power=2) == 2.0
 
 
@@ -84,7 +86,7 @@ def test_it_starts_dark_unless_its_power_is_not_searched(scene: SceneDescription
 @pytest.mark.parametrize("type", ["area", "point"])
 def test_a_dark_lamp_changes_nothing_even_in_view(scene: SceneDescription, type: str) -> None:
     lamp = LightControl(type=type, x=[-1, 1], y=0.0, z=0.9, power=0)
-    plain = MitsubaScene(scene, (SIDE, SIDE)).radiance({}, 0, 256)
+    plain = MitsubaScene(scene, (SIDE, SIDE)).render_radiance({}, 0, 256)
     assert float(rendered(lamp, scene, [0.9], 256).mean()) == pytest.approx(float(plain.mean()), rel=0.01)
 
 
@@ -111,13 +113,13 @@ def test_the_adjoint_of_power_and_colour_agrees_with_differences(scene: SceneDes
     inputs = bound.inputs(u)
     shining = {"area": "light.radiance", "point": "light.intensity"}[type]
     detached = {name: value.detach() for name, value in inputs.items()}
-    found = mitsuba_scene.adjoint(detached, weights, 2, 64, wrt=[shining])
+    found = mitsuba_scene.render_adjoint(detached, weights, 2, 64, wrt=[shining])
     (inputs[shining] * found[shining]).sum().backward()
     assert u.grad is not None
     for coordinate in range(2):
         step = 0.1 * torch.eye(2)[coordinate]
         above, below = (
-            float((mitsuba_scene.radiance(bound.inputs(u.detach() + way * step), 2, 64) * weights).sum())
+            float((mitsuba_scene.render_radiance(bound.inputs(u.detach() + way * step), 2, 64) * weights).sum())
             for way in (1.0, -1.0)
         )
         assert float(u.grad[coordinate]) == pytest.approx((above - below) / 0.2, rel=ROUNDING)
@@ -136,7 +138,7 @@ def test_two_lamps_stand_side_by_side(scene: SceneDescription) -> None:
         fill.bind(prepared).inputs(fill.bind(prepared).start)
     )
     assert names == {"key.ball", "key.radiance", "fill.position", "fill.intensity"}
-    assert names <= MitsubaScene(prepared, (8, 8)).names
+    assert names <= MitsubaScene(prepared, (8, 8)).input_names
     with pytest.raises(InputError, match="`controls` key: the scene has something of that name"):
         LightControl("key").prepare(prepared)
 

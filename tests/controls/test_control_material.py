@@ -10,16 +10,23 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls.material import NUMBERS, PATTERNS, SIDE, MaterialControl, covering, tile
+from advsearch.controls.material import (
+    PATTERNS,
+    SURFACE_PARAMETERS,
+    TILE_SIDE,
+    MaterialControl,
+    make_covering,
+    make_tile,
+)
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Material
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.mitsuba_backend.meshes import loadable, principled
-from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, mesh_translation, translation
+from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.mitsuba_backend.meshes import make_principled, to_loadable
+from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, translate_mesh, translate_part
 from advsearch.scene.mitsuba_backend.variant import mi
 from advsearch.scene.parts import PluginNumber, PluginNumbers
-from advsearch.scene.raster import rasterised
+from advsearch.scene.raster import rasterize_charts
 from advsearch.scene.settings import CHANNELS
 
 BASE_COLOR = "object.base_color"
@@ -30,7 +37,7 @@ AGREEMENT = 0.15
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 # ---- patterns -------------------------------------------------------------------------------------------------------
@@ -39,8 +46,8 @@ def scene() -> SceneDescription:
 @pytest.mark.medium
 @pytest.mark.parametrize("name", PATTERNS)
 def test_a_tile_continues_across_its_edges(name: str) -> None:
-    texels = tile(name)
-    assert texels.shape == (SIDE, SIDE, 3) and texels.dtype == np.float32
+    texels = make_tile(name)
+    assert texels.shape == (TILE_SIDE, TILE_SIDE, 3) and texels.dtype == np.float32
     assert 0.0 <= float(texels.min()) and float(texels.max()) <= 1.0
     for axis in (0, 1):
         steps = np.abs(np.diff(texels, axis=axis)).mean(axis=(1 - axis, 2))
@@ -49,15 +56,15 @@ def test_a_tile_continues_across_its_edges(name: str) -> None:
 
 
 def test_a_tile_with_a_seam_would_be_noticed() -> None:
-    texels = tile("zebra")[: SIDE - 37].swapaxes(0, 1)
+    texels = make_tile("zebra")[: TILE_SIDE - 37].swapaxes(0, 1)
     steps = np.abs(np.diff(texels, axis=1)).mean(axis=(0, 2))
     wrap = np.abs(texels[:, 0] - texels[:, -1]).mean()
     assert wrap > max(2.0 * float(steps.mean()), 1.2 * float(steps.max()))
 
 
 def test_patterns_differ_from_each_other() -> None:
-    colours = {name: tile(name).mean(axis=(0, 1)) for name in PATTERNS}
-    contrasts = {name: tile(name).std() for name in PATTERNS}
+    colours = {name: make_tile(name).mean(axis=(0, 1)) for name in PATTERNS}
+    contrasts = {name: make_tile(name).std() for name in PATTERNS}
     assert len({tuple(np.round(one, 2)) for one in colours.values()}) == len(PATTERNS)
     assert all(value > 0.01 for name, value in contrasts.items() if name != "plain")
     assert colours["grass"][1] > 1.2 * colours["grass"][0] and colours["brick"][0] > 1.5 * colours["brick"][2]
@@ -66,15 +73,15 @@ def test_patterns_differ_from_each_other() -> None:
 def test_a_pattern_has_one_scale_on_the_object_whatever_its_charts(scene: SceneDescription) -> None:
     """Texels that lie far apart in the texture and at one place on the object have one colour."""
     mesh = scene.object.mesh
-    texels = covering(mesh, "checker", 128)
-    charts = rasterised(mesh, 128)
-    positions, normals = charts.positions(), charts.normals()
+    texels = make_covering(mesh, "checker", 128)
+    charts = rasterize_charts(mesh, 128)
+    positions, normals = charts.compute_positions(), charts.compute_normals()
     flat = np.abs(normals[..., 2]) > 0.98  # seen from above only: the floor, the foot
     cell = PATTERNS["checker"].size / 4.0
     inside = (np.abs(positions[..., :2] / cell % 1.0 - 0.5) < 0.4).all(axis=-1) & flat
     odd = (np.floor(positions[..., 0] / cell) + np.floor(-positions[..., 1] / cell)) % 2.0
     assert inside.sum() > 100
-    expected = np.where(odd[inside] > 0.5, tile("checker").min(), tile("checker").max())
+    expected = np.where(odd[inside] > 0.5, make_tile("checker").min(), make_tile("checker").max())
     assert np.abs(texels[inside][:, 0] - expected).max() < 0.05
 
 
@@ -90,7 +97,7 @@ def searched(*names: str) -> MaterialControl:
 def test_the_start_is_the_objects_own_surface(scene: SceneDescription) -> None:
     bound = MaterialControl().bind(scene)
     inputs = bound.inputs(bound.start)
-    for name in NUMBERS:
+    for name in SURFACE_PARAMETERS:
         assert float(inputs[f"object.{name}"]) == pytest.approx(getattr(scene.material, name), abs=1e-3)
     torch.testing.assert_close(inputs[BASE_COLOR], srgb_to_linear(torch.from_numpy(scene.object.base_color)))
 
@@ -132,7 +139,7 @@ def test_a_fixed_material_is_where_the_search_starts(scene: SceneDescription) ->
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_extremes_have_finite_derivatives(scene: SceneDescription, share: float) -> None:
-    bound = searched(*NUMBERS, *CHANNELS).bind(scene)
+    bound = searched(*SURFACE_PARAMETERS, *CHANNELS).bind(scene)
     u = torch.full((7,), share, requires_grad=True)
     torch.stack([one.sum() for one in bound.inputs(u).values()]).sum().backward()
     assert u.grad is not None and bool(torch.isfinite(u.grad).all())
@@ -150,11 +157,11 @@ def test_every_way_into_a_number_has_the_same_guard(scene: SceneDescription) -> 
     """At a specular of exactly 0 Mitsuba's metal is black, and at a metallic of exactly 1 an adjoint has the wrong
     sign: searched, fixed, of a named material, and of a surface in Mitsuba's own words."""
     part = replace(scene.meshes["object"], material=Material(metallic=1.0, specular=0.0, clearcoat=0.0))
-    fixed = principled(part)["bsdf"]
+    fixed = make_principled(part)["bsdf"]
     assert (fixed["metallic"], fixed["specular"]) == (0.999, 1e-3) and "clearcoat" not in fixed
-    searched = {one.name: one for one in mesh_translation(part).inputs}
+    searched = {one.name: one for one in translate_mesh(part).inputs}
     by_key = PluginNumber("object.bsdf.brdf_0.specular", (0.5,), "mitsuba.specular")
-    searched |= {one.name: one for one in translation(PluginNumbers("mitsuba", (by_key,))).inputs}
+    searched |= {one.name: one for one in translate_part(PluginNumbers("mitsuba", (by_key,))).inputs}
     for name, value, rendered in (
         ("object.metallic", 1.0, 0.999),
         ("object.specular", 0.0, 1e-3),
@@ -162,16 +169,16 @@ def test_every_way_into_a_number_has_the_same_guard(scene: SceneDescription) -> 
         ("object.roughness", 0.0, 0.0),
         ("mitsuba.specular", 0.0, 1e-3),
     ):
-        assert float(searched[name].rendered(torch.tensor([value]))) == pytest.approx(rendered)
-    own = loadable({"type": "twosided", "bsdf": {"type": "principled", "specular": 0.0, "metallic": 1.0}})["bsdf"]
+        assert float(searched[name].to_rendered(torch.tensor([value]))) == pytest.approx(rendered)
+    own = to_loadable({"type": "twosided", "bsdf": {"type": "principled", "specular": 0.0, "metallic": 1.0}})["bsdf"]
     assert own["specular"] == 1e-3
-    assert loadable({"type": "principled", "eta": 1})["eta"] == 1.001
-    assert loadable({"type": "roughplastic", "specular": 0.0})["specular"] == 0.0
+    assert to_loadable({"type": "principled", "eta": 1})["eta"] == 1.001
+    assert to_loadable({"type": "roughplastic", "specular": 0.0})["specular"] == 0.0
 
 
 def test_equal_numbers_of_a_surface_stay_two(scene: SceneDescription) -> None:
     """Mitsuba makes them one where it may, so that both would change."""
-    made = mesh_translation(replace(scene.meshes["object"], material=Material()), IDLE_LOBES).plugins["object"]
+    made = translate_mesh(replace(scene.meshes["object"], material=Material()), IDLE_LOBES).plugins["object"]
     keys = mi.traverse(made).keys()
     assert [one for one in ("clearcoat", "sheen") if not any(key.endswith(f".{one}.value") for key in keys)] == []
 

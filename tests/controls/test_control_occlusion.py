@@ -14,18 +14,18 @@ import torch
 import advsearch
 from advsearch.controls import make_space
 from advsearch.controls.camera import CameraControl
-from advsearch.controls.occlusion import BUNDLED, OPTIONS, OcclusionControl, Placement, loaded, made
-from advsearch.controls.occlusion.silhouettes import Passage, middle_axes, silhouette
+from advsearch.controls.occlusion import BUNDLED, OPTIONS, OcclusionControl, Placement, load_occluder, make_primitive
+from advsearch.controls.occlusion.silhouettes import Passage, compute_center_axes, rasterise_silhouette
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.camera_model import bundled, pinhole
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.camera_model import make_bundled_models, make_pinhole
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import Frame, camera_to_world, object_to_world
 from advsearch.scene.library import list_objects
-from advsearch.scene.mitsuba_backend.parts import translation
-from advsearch.scene.mitsuba_backend.variant import mitsuba
-from advsearch.scene.parts import MeshPart, sphere
-from advsearch.scene.raster import pixels_in
+from advsearch.scene.mitsuba_backend.parts import translate_part
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
+from advsearch.scene.parts import MeshPart, make_sphere
+from advsearch.scene.raster import rasterize_triangles
 
 ACCURACY = 0.02
 """Allowed error of a hidden share: silhouettes have 128 pixels along their longer side."""
@@ -33,14 +33,14 @@ ACCURACY = 0.02
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 def hidden(scene: SceneDescription, **settings: Any) -> Placement:
     """The placement at the upper end of the coverage's range."""
     control = OcclusionControl(**{"coverage": [0, 0.9], **settings})
     bound = control.bind(control.prepare(scene))
-    return bound.placement(bound.values(torch.ones_like(bound.start)), {})
+    return bound.find_placement(bound.values(torch.ones_like(bound.start)), {})
 
 
 # ---- silhouettes ----------------------------------------------------------------------------------------------------
@@ -48,7 +48,7 @@ def hidden(scene: SceneDescription, **settings: Any) -> Placement:
 
 def test_a_square_is_rasterised_without_gaps_or_excess() -> None:
     corners = np.array([[(-0.5, -0.5), (9.5, -0.5), (9.5, 9.5)], [(-0.5, -0.5), (9.5, 9.5), (-0.5, 9.5)]])
-    _, row, column, weights = pixels_in(corners, (12, 14))
+    _, row, column, weights = rasterize_triangles(corners, (12, 14))
     assert {(int(r), int(c)) for r, c in zip(row, column, strict=True)} == {
         (r, c) for r in range(10) for c in range(10)
     }
@@ -56,30 +56,33 @@ def test_a_square_is_rasterised_without_gaps_or_excess() -> None:
 
 
 def test_a_silhouette_has_the_area_of_what_it_shows() -> None:
-    ball = made("sphere").mesh
+    ball = make_primitive("sphere").mesh
     points = ball.vertices.astype(np.float64) + np.array([0.1, -0.2, 3.0])
-    found = silhouette(points, ball.faces)
+    found = rasterise_silhouette(points, ball.faces)
     assert found is not None
     share = math.pi / 4.0 * (2 * 0.5 / math.sqrt(3.0**2 - 0.5**2)) ** 2
     window = (found.window.right - found.window.left) * (found.window.high - found.window.low)
     assert found.mask.mean() * window == pytest.approx(share, rel=0.04)
-    behind = silhouette(points - np.array([0.0, 0.0, 6.0]), ball.faces)
-    aside = silhouette(points + np.array([9.0, 0.0, 0.0]), ball.faces, Frame.of(35.0))
+    behind = rasterise_silhouette(points - np.array([0.0, 0.0, 6.0]), ball.faces)
+    aside = rasterise_silhouette(points + np.array([9.0, 0.0, 0.0]), ball.faces, Frame.of(35.0))
     assert behind is None and aside is None
 
 
 def test_a_card_across_a_card_hides_what_geometry_says() -> None:
-    card = made("card").mesh
+    card = make_primitive("card").mesh
     points = np.stack([card.vertices[:, 1], card.vertices[:, 2], card.vertices[:, 0]], axis=1).astype(np.float64)
     ahead = np.array([0.0, 0.0, 10.0])
-    seen, cover = silhouette(points + ahead, card.faces), silhouette(points * 2.0 + ahead, card.faces)
+    seen, cover = (
+        rasterise_silhouette(points + ahead, card.faces),
+        rasterise_silhouette(points * 2.0 + ahead, card.faces),
+    )
     assert seen is not None and cover is not None
-    directions = seen.directions()
-    sweep = Passage(directions, cover, middle_axes(directions), direction=0.0)
+    directions = seen.list_directions()
+    sweep = Passage(directions, cover, compute_center_axes(directions), direction=0.0)
     angles = np.arctan(np.array([2.0, 1.25, 1.0, 0.75, 0.0]) / 10.0)
-    np.testing.assert_allclose(sweep.coverage(angles), [0.0, 0.25, 0.5, 0.75, 1.0], atol=ACCURACY)
-    assert sweep.solve(0.3, 0.5) == pytest.approx(math.atan(0.12), abs=0.002)
-    assert sweep.solve(1.0, 0.5) < math.atan(0.06)
+    np.testing.assert_allclose(sweep.compute_coverage(angles), [0.0, 0.25, 0.5, 0.75, 1.0], atol=ACCURACY)
+    assert sweep.find_angle(0.3, 0.5) == pytest.approx(math.atan(0.12), abs=0.002)
+    assert sweep.find_angle(1.0, 0.5) < math.atan(0.06)
 
 
 # ---- the control ----------------------------------------------------------------------------------------------------
@@ -88,14 +91,14 @@ def test_a_card_across_a_card_hides_what_geometry_says() -> None:
 def test_the_occluders_offered_are_there() -> None:
     assert set(BUNDLED) <= set(list_objects())
     for name in OPTIONS:
-        mesh = (made if name in ("card", "sphere") else loaded)(name).mesh
+        mesh = (make_primitive if name in ("card", "sphere") else load_occluder)(name).mesh
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         assert float((high - low).max()) == pytest.approx(1.0, abs=1e-5)
         np.testing.assert_allclose(low + high, 0.0, atol=1e-5)
 
 
 def test_the_sphere_is_closed_and_faces_outwards() -> None:
-    mesh = sphere(8, 12)
+    mesh = make_sphere(8, 12)
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     normal = np.cross(b - a, c - a)
     assert len(mesh.faces) == 2 * 7 * 12
@@ -110,12 +113,12 @@ def test_the_share_asked_for_is_hidden(scene: SceneDescription, which: str, dire
     assert placed.hidden == pytest.approx(0.3, abs=ACCURACY)
 
 
-FOLDING = pinhole(60.0, 1.0).with_numbers(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11]))
+FOLDING = make_pinhole(60.0, 1.0).with_numbers(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11]))
 SEEN = {
-    "pinhole": (pinhole(35.0, 1.0), {}),
-    "wide picture": (pinhole(35.0, 2.0), {}),
-    "fisheye": (bundled()["fisheye"], {"camera.distance": 0.8}),
-    "panorama": (bundled()["equirectangular"], {"camera.distance": 0.8}),
+    "pinhole": (make_pinhole(35.0, 1.0), {}),
+    "wide picture": (make_pinhole(35.0, 2.0), {}),
+    "fisheye": (make_bundled_models()["fisheye"], {"camera.distance": 0.8}),
+    "panorama": (make_bundled_models()["equirectangular"], {"camera.distance": 0.8}),
     "barrel": (replace(FOLDING, name="test"), {"camera.distance": 1.0}),
 }
 
@@ -124,15 +127,17 @@ SEEN = {
 @pytest.mark.parametrize("through", list(SEEN))
 def test_primary_rays_find_the_same_share(through: str, which: str) -> None:
     model, settings = SEEN[through]
-    scene = replace(describe("mug", size=1.0, given=settings), aspect=2.0 if through == "wide picture" else 1.0)
+    scene = replace(load_description("mug", size=1.0, given=settings), aspect=2.0 if through == "wide picture" else 1.0)
     scene = replace(scene, camera_model=model if model.name else None)
     control = OcclusionControl(which=which, coverage=[0, 0.3], direction=30.0, size=0.9, turn=50.0)
     bound = control.bind(control.prepare(scene))
     matrix = bound.inputs(torch.ones(1))["occlusion.to_world"].double().numpy()
-    occluder = (made if which == "sphere" else loaded)(which)
+    occluder = (make_primitive if which == "sphere" else load_occluder)(which)
     camera = camera_to_world(scene)
     along = (torch.arange(200).double() + 0.5) / 200.0
-    directions, inside = model.rays(torch.stack(torch.meshgrid(along, along, indexing="xy"), dim=-1).reshape(-1, 2))
+    directions, inside = model.compute_rays(
+        torch.stack(torch.meshgrid(along, along, indexing="xy"), dim=-1).reshape(-1, 2)
+    )
     rays = (directions[inside > 0.0].numpy() * (-1.0, -1.0, 1.0)) @ camera[:3, :3].T
     pose = object_to_world(scene)
     object_hit = met(MeshPart("object", scene.object.mesh, scene.object.base_color, to_world=pose), camera[:3, 3], rays)
@@ -142,8 +147,8 @@ def test_primary_rays_find_the_same_share(through: str, which: str) -> None:
 
 def met(part: MeshPart, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Which rays (N, 3) from a point meet a mesh, by Mitsuba."""
-    mi = mitsuba()
-    scene = mi.load_dict({"type": "scene", **translation(part).plugins})
+    mi = import_mitsuba()
+    scene = mi.load_dict({"type": "scene", **translate_part(part).plugins})
     towards = mi.Vector3f(*(mi.Float(one.astype(np.float32)) for one in rays.T))
     return np.array(scene.ray_test(mi.Ray3f(mi.Point3f(*origin.tolist()), towards)))
 

@@ -14,13 +14,13 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import make_control, make_space
-from advsearch.controls.patch import BASE_COLOR, PatchControl, towards_camera
+from advsearch.controls.patch import BASE_COLOR, PatchControl, find_side_towards_camera
 from advsearch.controls.texture import TextureControl
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.scene.assets import Floats, Mesh
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.assets import Float32Array, Mesh
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.library import list_objects, load_object
-from advsearch.scene.raster import MeshSurface, rasterised
+from advsearch.scene.raster import MeshSurface, rasterize_charts
 from covering import only
 
 SIDE = 512
@@ -28,14 +28,14 @@ SIDE = 512
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 @pytest.fixture(scope="module")
-def surface(scene: SceneDescription) -> tuple[Floats, Floats, Floats]:
+def surface(scene: SceneDescription) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Positions, normals and areas of the texels of the mug."""
-    charts = rasterised(scene.object.mesh, SIDE)
-    return charts.positions(), charts.normals(), charts.areas()
+    charts = rasterize_charts(scene.object.mesh, SIDE)
+    return charts.compute_positions(), charts.compute_normals(), charts.compute_areas()
 
 
 def bound(scene: SceneDescription, **settings: Any) -> PatchControl:
@@ -61,23 +61,23 @@ def covered(control: PatchControl, side: int = 32) -> np.ndarray:
 @pytest.mark.parametrize("name", only(["mug", "book", "hammer"], list_objects()))
 def test_texels_know_their_place_on_every_object(name: str) -> None:
     mesh = load_object(name).mesh
-    charts = rasterised(mesh, side := 512)
+    charts = rasterize_charts(mesh, side := 512)
     uvs = np.einsum("hwk,hwkc->hwc", charts.weights, mesh.uvs[mesh.faces[charts.face]])
     rows, columns = np.mgrid[:side, :side]
     wanted = np.stack([(columns + 0.5) / side, 1.0 - (rows + 0.5) / side], axis=-1)
-    np.testing.assert_allclose(side * uvs[charts.covered], side * wanted[charts.covered], atol=0.01)
+    np.testing.assert_allclose(side * uvs[charts.is_covered], side * wanted[charts.is_covered], atol=0.01)
     corners = mesh.vertices[mesh.faces].astype(float)
     total = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    assert float(charts.areas().sum()) == pytest.approx(total, rel=0.02)
+    assert float(charts.compute_areas().sum()) == pytest.approx(total, rel=0.02)
 
 
 def test_texels_beside_a_chart_continue_it(scene: SceneDescription) -> None:
-    charts = rasterised(scene.object.mesh, 256)
-    positions, normals, mask = charts.positions(), charts.normals(), charts.touched
+    charts = rasterize_charts(scene.object.mesh, 256)
+    positions, normals, mask = charts.compute_positions(), charts.compute_normals(), charts.is_readable
     assert positions.shape == normals.shape == (256, 256, 3) and mask.shape == (256, 256)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1.0, atol=1e-4)
-    charts = rasterised(scene.object.mesh, 256)
-    assert mask[charts.covered].all() and 0 < (mask & ~charts.covered).sum() < charts.covered.sum()
+    charts = rasterize_charts(scene.object.mesh, 256)
+    assert mask[charts.is_covered].all() and 0 < (mask & ~charts.is_covered).sum() < charts.is_covered.sum()
     low, high = scene.object.mesh.vertices.min(axis=0), scene.object.mesh.vertices.max(axis=0)
     assert (positions >= low - 1e-5).all() and (positions <= high + 1e-5).all()
 
@@ -87,14 +87,14 @@ def test_texture_coordinates_without_area_are_refused(scene: SceneDescription) -
 
     empty = replace(scene.object.mesh, uvs=np.full_like(scene.object.mesh.uvs, 2.0))
     with pytest.raises(InputError, match="none of the 64 x 64 texels lies in a triangle; unwrap the mesh again"):
-        rasterised(empty, 64)
+        rasterize_charts(empty, 64)
 
 
 def test_a_ray_meets_the_near_wall_and_a_ray_that_misses_the_nearest_corner(scene: SceneDescription) -> None:
     surface = MeshSurface(scene.object.mesh)
-    face, point = surface.hit(np.array([-3.0, 0.0, 0.4]), np.array([1.0, 0.0, 0.0]))
+    face, point = surface.find_hit(np.array([-3.0, 0.0, 0.4]), np.array([1.0, 0.0, 0.0]))
     assert point[0] < -0.3 and point[1:] == pytest.approx([0.0, 0.4]) and surface.normals[face, 0] < -0.9
-    face, point = surface.hit(np.array([-3.0, 0.0, 9.0]), np.array([1.0, 0.0, 0.0]))
+    face, point = surface.find_hit(np.array([-3.0, 0.0, 9.0]), np.array([1.0, 0.0, 0.0]))
     assert point[2] == pytest.approx(float(scene.object.mesh.vertices[:, 2].max()))
 
 
@@ -106,12 +106,14 @@ def test_the_patch_has_its_size_on_the_surface(scene: SceneDescription) -> None:
     for size in (0.1, 0.3, 0.5):
         control = bound(scene, azimuth=180.0, height=0.5, size=size)
         share = covered(control)
-        area = float((share * rasterised(scene.object.mesh, len(share)).areas()).sum())
+        area = float((share * rasterize_charts(scene.object.mesh, len(share)).compute_areas()).sum())
         assert area == pytest.approx(size**2, rel=0.04)
 
 
 @pytest.mark.medium
-def test_it_bleeds_through_no_wall(scene: SceneDescription, surface: tuple[Floats, Floats, Floats]) -> None:
+def test_it_bleeds_through_no_wall(
+    scene: SceneDescription, surface: tuple[Float32Array, Float32Array, Float32Array]
+) -> None:
     positions, normals, _ = surface
     inside = covered(bound(scene, azimuth=180.0, height=0.5, size=0.5)) > 0.01
     outwards = positions[inside] * np.array([1.0, 1.0, 0.0])
@@ -126,12 +128,14 @@ def test_it_stays_on_the_part_that_it_is_stuck_to() -> None:
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=np.uint32)
     up = np.tile(np.array([0, 0, 1], np.float32), (8, 1))
     surface = MeshSurface(Mesh(vertices, faces, up, vertices[:, :2]))
-    region = surface.region(0, np.array([0.9, 0.1, 0.0]), np.array([0.0, 0.0, 1.0]), 5.0)
+    region = surface.find_region(0, np.array([0.9, 0.1, 0.0]), np.array([0.0, 0.0, 1.0]), 5.0)
     assert region.tolist() == [True, True, False, False]
-    assert not surface.region(0, np.array([0.9, 0.1, 0.0]), np.array([0.0, 0.0, 1.0]), 0.05)[2:].any()
+    assert not surface.find_region(0, np.array([0.9, 0.1, 0.0]), np.array([0.0, 0.0, 1.0]), 0.05)[2:].any()
 
 
-def test_its_top_is_up_and_its_left_is_left(scene: SceneDescription, surface: tuple[Floats, Floats, Floats]) -> None:
+def test_its_top_is_up_and_its_left_is_left(
+    scene: SceneDescription, surface: tuple[Float32Array, Float32Array, Float32Array]
+) -> None:
     positions = surface[0]
     control = bound(scene, azimuth=0.0, height=0.55, size=0.3)
     ramp = torch.linspace(0.0, 1.0, 32)
@@ -153,16 +157,16 @@ def test_a_quarter_turn_is_a_turned_picture(scene: SceneDescription) -> None:
 
 
 def test_it_faces_the_camera_by_default(scene: SceneDescription) -> None:
-    azimuth, height = towards_camera(scene)
+    azimuth, height = find_side_towards_camera(scene)
     assert azimuth == pytest.approx(scene.number("camera.azimuth")) and 0.5 < height < 0.75
     turned = scene.with_values(pose__yaw=30.0)
-    assert towards_camera(turned)[0] == pytest.approx(azimuth - 30.0, abs=1e-3)
+    assert find_side_towards_camera(turned)[0] == pytest.approx(azimuth - 30.0, abs=1e-3)
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize("name", only(["mug", "book", "hammer"], list_objects()))
 def test_every_object_takes_a_patch_anywhere(name: str) -> None:
-    scene = describe(name)
+    scene = load_description(name)
     control = bound(scene, azimuth=[0, 360], height=[0.0, 1.0], resolution=4)
     for share in (0.0, 0.3, 0.7, 1.0):
         u = control.start.clone()
@@ -276,13 +280,13 @@ def test_groups_say_what_is_searched(scene: SceneDescription) -> None:
     assert all_of_it.groups[1].periodic and all_of_it.groups[1].valid == ("differences",)
     said = all_of_it.describe(all_of_it.start)
     assert set(said) == {"patch.linf", "patch.rms", "patch.azimuth", "patch.size"}
-    assert said["patch.azimuth"]["value"] == pytest.approx(towards_camera(scene)[0], abs=1e-3)
+    assert said["patch.azimuth"]["value"] == pytest.approx(find_side_towards_camera(scene)[0], abs=1e-3)
 
 
 def test_a_printers_gamut_narrows_the_pixels(scene: SceneDescription) -> None:
     control = bound(scene, pixels=[0.2, 0.8], norm="l2", resolution=4)
     for value in (0.0, 1.0):
-        (name, kept) = list(control.artifacts(torch.full_like(control.start, value)).items())[1]
+        (name, kept) = list(control.get_artifact_images(torch.full_like(control.start, value)).items())[1]
         assert name == "patch-pixels"
         torch.testing.assert_close(kept, torch.full((4, 4, 3), 0.2 + 0.6 * value))
     assert control.groups[0].budget.epsilon == pytest.approx(0.1 * math.sqrt(48) / 0.6)
@@ -292,7 +296,7 @@ def test_a_printers_gamut_narrows_the_pixels(scene: SceneDescription) -> None:
 def test_what_is_kept_can_be_printed_and_stuck_on_again(scene: SceneDescription, tmp_path: Path) -> None:
     control = bound(scene, resolution=16)
     u = torch.rand(control.start.shape, generator=torch.Generator().manual_seed(2))
-    kept = control.artifacts(u)
+    kept = control.get_artifact_images(u)
     assert kept["patch"].shape == (512, 512, 3)
     pixels = kept["patch-pixels"]
     path = tmp_path / "patch.png"
@@ -306,10 +310,10 @@ def test_what_is_kept_can_be_printed_and_stuck_on_again(scene: SceneDescription,
 
 def test_settings_make_the_same_control_again(scene: SceneDescription) -> None:
     control = PatchControl("second", size=[0.1, 0.4], resolution=8, norm="linf")
-    assert control.settings() == {"kind": "patch", "size": [0.1, 0.4], "resolution": 8, "norm": "linf"}
-    again = make_control("second", control.settings())
-    assert again.settings() == control.settings() and again.name == "second"
-    assert make_control("patch.azimuth").settings() == {"azimuth": [0.0, 360.0]}
+    assert control.to_settings() == {"kind": "patch", "size": [0.1, 0.4], "resolution": 8, "norm": "linf"}
+    again = make_control("second", control.to_settings())
+    assert again.to_settings() == control.to_settings() and again.name == "second"
+    assert make_control("patch.azimuth").to_settings() == {"azimuth": [0.0, 360.0]}
 
 
 @pytest.mark.parametrize(

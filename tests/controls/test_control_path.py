@@ -15,12 +15,12 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import Control, make_space
-from advsearch.controls.path import CLEAN_AT, PATHS, PathControl, start_of
+from advsearch.controls.path import CLEAN_TIME_FRACTION, PATHS, PathControl, get_start_poses
 from advsearch.controls.path.pose_files import SENSOR_AXES, WORLD_TO_Z_UP
-from advsearch.engine.rendering import sight_of
+from advsearch.engine.rendering import make_sight
 from advsearch.errors import FileFormatError, InputError
-from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.geometry import camera_to_world, middle, object_to_world
+from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.geometry import camera_to_world, compute_center, object_to_world
 from advsearch.tasks import Facts
 
 WAY = "time, x, y, z\n3, 2, 0, 1\n4, 2, 2, 1\n7, -2, 2, 1\n"
@@ -29,7 +29,7 @@ WAY = "time, x, y, z\n3, 2, 0, 1\n4, 2, 2, 1\n7, -2, 2, 1\n"
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug", size=1.0, given={"camera.roll": 20.0, "camera.azimuth": 70.0})
+    return load_description("mug", size=1.0, given={"camera.roll": 20.0, "camera.azimuth": 70.0})
 
 
 def bound(scene: SceneDescription, **given: Any) -> PathControl:
@@ -54,7 +54,7 @@ def test_a_frame_of_each_path_is_the_scene_as_it_is_and_others_are_not(
 ) -> None:
     control = bound(scene, path=path, moves=moves)
     own = torch.from_numpy((camera_to_world if moves == "camera" else object_to_world)(scene)).float()
-    assert float(control.start) == CLEAN_AT[path]
+    assert float(control.start) == CLEAN_TIME_FRACTION[path]
     torch.testing.assert_close(placed(control, float(control.start)), own, atol=1e-5, rtol=0)
     assert float((placed(control, 0.3) - own).abs().max()) > 0.1
     turning = placed(control, 0.3)[:3, :3] / float(own[:3, 0].norm())
@@ -63,7 +63,7 @@ def test_a_frame_of_each_path_is_the_scene_as_it_is_and_others_are_not(
 
 @pytest.mark.parametrize("moves", ["camera", "object"])
 def test_distances_are_those_of_the_geometry(moves: str) -> None:
-    scene = describe("mug", size=1.0, given={"camera.elevation": 0.0, "camera.distance": 2.0})
+    scene = load_description("mug", size=1.0, given={"camera.elevation": 0.0, "camera.distance": 2.0})
     away = distance(bound(scene, path="orbit", moves=moves), 0.7)
     assert away == pytest.approx(2.0, abs=1e-4)
     near = [distance(bound(scene, path="approach", reach=5.0, moves=moves), share) for share in (0.0, 0.25, 1.0)]
@@ -77,7 +77,7 @@ def test_both_move_as_each_does_alone_and_the_camera_looks_at_the_object(scene: 
     both = bound(scene, path=path)
     first, second = path.split("+")
     camera, thing = bound(scene, path=first), bound(scene, path=second, moves="object")
-    center = torch.cat([torch.from_numpy(middle(scene)).float(), torch.ones(1)])
+    center = torch.cat([torch.from_numpy(compute_center(scene)).float(), torch.ones(1)])
     base = torch.from_numpy(object_to_world(scene)).float()
     for share in (0.0, 0.3, 0.8):
         poses = both.inputs(torch.tensor([share]))
@@ -127,7 +127,7 @@ def test_the_box_of_each_frame_is_where_both_have_moved_to(tmp_path: Path) -> No
         "0,6,0,0,0,0,0,0,1,0,0\n1,4,0,0,0,0,0,0,-0.5,0,180\n"
     )
     one = advsearch.load_scene("mug").renderer({"path": {"path": str(file)}}, resolution=64, denoise="none")
-    scene = one.scene.made[0]
+    scene = one.scene.definition[0]
     vertices = torch.from_numpy(scene.object.mesh.vertices).double()
     places = torch.cat([vertices, torch.ones(len(vertices), 1, dtype=torch.float64)], dim=1)
     for share in (0.0, 0.8):
@@ -135,14 +135,14 @@ def test_the_box_of_each_frame_is_where_both_have_moved_to(tmp_path: Path) -> No
         seen = torch.linalg.inv(poses["camera.to_world"]) @ poses["object.to_world"] @ places.T
         focal = 32.0 / math.tan(math.radians(scene.number("camera.fov") / 2.0))
         flat = 32.0 - focal * (seen[:2] / seen[2]).T
-        box = Facts("mug", look=partial(sight_of, one.surfaces(torch.tensor([share])))).box
+        box = Facts("mug", compute_sight=partial(make_sight, one.surfaces(torch.tensor([share])))).box
         assert box == pytest.approx((*flat.amin(dim=0).tolist(), *flat.amax(dim=0).tolist()), abs=1.2)
 
 
 @pytest.mark.parametrize("path", PATHS)
 def test_moving_the_camera_or_the_object_is_the_same_drive(path: str) -> None:
     """Up to the sense of the turn: what the camera sees of the object's middle is as far away."""
-    scene = describe("mug", size=1.0, given={"camera.elevation": 30.0})
+    scene = load_description("mug", size=1.0, given={"camera.elevation": 30.0})
     camera, thing = (bound(scene, path=path, moves=moves) for moves in ("camera", "object"))
     for share in (0.0, 0.4, 0.8):
         assert distance(camera, share) == pytest.approx(distance(thing, share), rel=1e-4)
@@ -160,7 +160,7 @@ def test_the_derivative_is_that_of_differences(scene: SceneDescription, path: st
 
 
 def test_a_way_of_a_file_is_followed(scene: SceneDescription, tmp_path: Path) -> None:
-    file, center = tmp_path / "way.csv", torch.from_numpy(middle(scene)).float()
+    file, center = tmp_path / "way.csv", torch.from_numpy(compute_center(scene)).float()
     file.write_text("\ufeff" + WAY)
     control = bound(scene, path=str(file))
     assert float(str(control.describe(torch.ones(1))["path.time"]["value"])) == pytest.approx(4.0)
@@ -184,7 +184,7 @@ def test_a_file_says_where_the_camera_looks_and_how_the_object_is_turned(
         placed(bound(scene, path=str(turns), moves="object"), 1),
     )
     torch.testing.assert_close(pose[:3, 0], torch.stack([-own[1, 0], own[0, 0], own[2, 0]]), atol=1e-5, rtol=0)
-    there = torch.cat([torch.from_numpy(middle(scene)).float(), torch.ones(1)])
+    there = torch.cat([torch.from_numpy(compute_center(scene)).float(), torch.ones(1)])
     shift = (pose @ torch.linalg.inv(own) @ there - there)[:3]
     torch.testing.assert_close(shift, torch.tensor([4.0, 0.0, 0.0]), atol=1e-5, rtol=0)
 
@@ -192,7 +192,7 @@ def test_a_file_says_where_the_camera_looks_and_how_the_object_is_turned(
 def test_a_camera_over_the_object_has_a_pose(tmp_path: Path) -> None:
     file = tmp_path / "over.csv"
     file.write_text("time,x,y,z\n0,0,0,3\n1,0,0,2\n")
-    assert bool(torch.isfinite(placed(bound(describe("mug", size=1.0), path=str(file)), 0.5)).all())
+    assert bool(torch.isfinite(placed(bound(load_description("mug", size=1.0), path=str(file)), 0.5)).all())
 
 
 @pytest.mark.parametrize(
@@ -222,10 +222,10 @@ def test_a_path_through_what_the_camera_looks_at_is_refused(
 
 
 def test_a_path_through_what_it_looks_at_is_refused_where_no_file_is(tmp_path: Path) -> None:
-    level = describe("mug", size=1.0, given={"camera.elevation": 0.0})
+    level = load_description("mug", size=1.0, given={"camera.elevation": 0.0})
     file = tmp_path / "car.csv"
     file.write_text("time,x,y,z\n0,-9,0,0\n1,9,0,0\n")  # past the middle; the camera is at +x, and looks at the object
-    east = describe("mug", size=1.0, given={"camera.elevation": 0.0, "camera.azimuth": 0.0})
+    east = load_description("mug", size=1.0, given={"camera.elevation": 0.0, "camera.azimuth": 0.0})
     with pytest.raises(InputError, match="the camera is where it looks"):
         bound(east, path=f"approach+{file}")
     for path in (*PATHS, "approach+orbit", "pass+pass"):
@@ -237,9 +237,9 @@ def test_as_many_times_at_once_are_those_one_by_one(scene: SceneDescription, tmp
     file = tmp_path / "way.csv"
     file.write_text(WAY)
     for path in (*PATHS, f"{file}+orbit", f"approach+{file}", "pass+pass"):
-        control = PathControl(path=path).within(scene)
+        control = PathControl(path=path).with_scene(scene)
         time = torch.linspace(0.0, control.seconds, 7)
-        start = start_of(control.scene, time.device)
+        start = get_start_poses(control.scene, time.device)
 
         def both(at: Tensor, control: PathControl = control, start: Any = start) -> Tensor:
             (ways,) = control._paths
@@ -377,7 +377,7 @@ def test_of_several_paths_each_configuration_has_one_as_it_is_alone(scene: Scene
         assert set(poses) == {"camera.to_world", "object.to_world"}  # one set, so that no draw is a surprise
         for one, pose in own.items():
             torch.testing.assert_close(poses[one], pose)
-    assert bound(scene, path=["approach", "orbit"]).settings() == {"path": ["approach", "orbit"]}
+    assert bound(scene, path=["approach", "orbit"]).to_settings() == {"path": ["approach", "orbit"]}
 
 
 @pytest.mark.parametrize("path", ["approach,approach", "approach,", "approach,nowhere", ",".join(["a.csv"] * 70)])
@@ -459,10 +459,10 @@ def test_a_trajectory_is_followed_by_a_camera_with_its_axes(
     given: dict[str, Any] = {"axes": axes, "up": up, "object_at": list(at)}
     if form == "kitti":
         given["seconds"] = 2.0
-    level = describe("mug", size=1.0)
+    level = load_description("mug", size=1.0)
     control = bound(level, path=str(file), **given)
     assert control.seconds == pytest.approx(2.0)
-    center = torch.from_numpy(middle(level)).float()
+    center = torch.from_numpy(compute_center(level)).float()
     ahead = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # columns: left, up, ahead
     for share in (0.0, 0.3, 1.0):
         pose = placed(control, share)
@@ -476,7 +476,7 @@ def test_a_trajectory_is_followed_by_a_camera_with_its_axes(
 
 
 def test_what_a_trajectory_does_not_state_is_said_and_odd_axes_are_doubted(tmp_path: Path) -> None:
-    file, level = tmp_path / "poses.tum", describe("mug", size=1.0)
+    file, level = tmp_path / "poses.tum", load_description("mug", size=1.0)
     file.write_text(trajectory("tum"))
     (note,) = [note for note in PathControl(path=str(file)).prepare(level).notes if "poses.tum" in note]
     assert "axes optical (x right, y down, z ahead), up z, object_at [0, 0, 0]" in note
@@ -550,7 +550,7 @@ def test_settings_of_trajectories_are_checked(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="axes: is about a trajectory"):
         PathControl(path="orbit", axes="flu")
     with pytest.raises(InputError, match="axes: is about a trajectory"):
-        PathControl(axes="flu").prepare(describe("mug", size=1.0))
+        PathControl(axes="flu").prepare(load_description("mug", size=1.0))
     for given in ([1, 2], "here", [1, 2, math.nan], [1, 2, "3"]):
         with pytest.raises(InputError, match="object_at: expected three numbers"):
             PathControl(path=str(file), object_at=given)

@@ -15,18 +15,18 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.cli.exporters.projection.images import write_projection
 from advsearch.controls import make_control
-from advsearch.controls.projector.projector import AMBIENT, ProjectorControl
+from advsearch.controls.projector.projector import DEFAULT_AMBIENT_LUX, ProjectorControl
 from advsearch.controls.space import Space
-from advsearch.engine.gradients import interior_point
+from advsearch.engine.gradients import find_interior_point
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.files import read_png, write_png
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.description import describe
-from advsearch.scene.geometry import camera_to_world, middle
+from advsearch.scene.description import load_description
+from advsearch.scene.geometry import camera_to_world, compute_center
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.lights import BasisRenderer, predicting, why_not
+from advsearch.scene.transport.lights import BasisRenderer, find_refusal, make_predictor
 from advsearch.scene.transport.matrix import LinearRenderer
 from samples import make_attacked
 
@@ -49,7 +49,7 @@ def space_of(renderer: Renderer) -> Space:
 
 def raw(renderer: Renderer, u: Tensor, spp: int) -> Tensor:
     """Radiance (H, W, 3) without the denoiser, at one seed."""
-    return renderer.scene.radiance(renderer.scene.assembly(renderer.space.inputs(u)), 1, spp)
+    return renderer.scene.render_radiance(renderer.scene.assembly(renderer.space.inputs(u)), 1, spp)
 
 
 def smooth(renderer: Renderer, seed: int) -> Tensor:
@@ -60,17 +60,19 @@ def smooth(renderer: Renderer, seed: int) -> Tensor:
 
 def test_white_puts_its_lumens_over_its_area_on_what_faces_it() -> None:
     """White ground below a projector in the dark: radiance = E(ambient) / pi x lux / ambient lux."""
-    scene = describe("mug", DARK, given={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0})
+    scene = load_description(
+        "mug", DARK, given={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0}
+    )
     control = ProjectorControl(elevation=89, distance=3 * scene.metres, fov=20, lumens=5, ambient=50, resolution=4)
     prepared = control.prepare(scene)
     bound = control.bind(prepared)
     white = torch.ones_like(bound.start)
-    seen = MitsubaScene(prepared, (SIDE, SIDE)).radiance(bound.inputs(white), 0, 64)
+    seen = MitsubaScene(prepared, (SIDE, SIDE)).render_radiance(bound.inputs(white), 0, 64)
     lux = 5.0 / (2.0 * 3.0 * scene.metres * math.tan(math.radians(10.0))) ** 2
     described = bound.describe(white)
     assert described["projector.white"]["value"] == pytest.approx(lux)
     assert described["projector.beside_ambient"]["value"] == pytest.approx(lux / 50.0)
-    farther = (3.0 / (3.0 + middle(scene)[2])) ** 2  # the ground is below the middle
+    farther = (3.0 / (3.0 + compute_center(scene)[2])) ** 2  # the ground is below the middle
     expected = lux / 50.0 * scene.metered_irradiance / math.pi * farther
     camera = camera_to_world(scene)
     x, y, z = -camera[:3, 3] @ camera[:3, :3]
@@ -88,9 +90,9 @@ def test_lux_are_those_of_the_place_where_it_has_a_unit() -> None:
     dusk, studio = (space.controls[0] for space in lit.values())
     assert isinstance(dusk, ProjectorControl) and isinstance(studio, ProjectorControl)
     assert dusk.ambient is not None and 5.0 < dusk.ambient < 50.0  # civil dusk
-    assert studio.ambient == AMBIENT
-    assert any("lux" in note for note in lit["studio"].notes(studio.scene))
-    assert not any("lux" in note for note in lit["avenue-dusk"].notes(dusk.scene))
+    assert studio.ambient == DEFAULT_AMBIENT_LUX
+    assert any("lux" in note for note in lit["studio"].list_notes(studio.scene))
+    assert not any("lux" in note for note in lit["avenue-dusk"].list_notes(dusk.scene))
 
 
 @pytest.mark.medium
@@ -111,9 +113,9 @@ def test_the_adjoint_is_the_difference() -> None:
     inputs = renderer.scene.assembly(renderer.space.inputs(0.5 + 0.0 * renderer.start))
     change = torch.rand(inputs["projector.pattern"].shape, generator=generator)
     weight = torch.randn(SIDE, SIDE, 3, generator=generator)
-    (gradient,) = scene.adjoint(inputs, weight, 3, 16, wrt=["projector.pattern"]).values()
+    (gradient,) = scene.render_adjoint(inputs, weight, 3, 16, wrt=["projector.pattern"]).values()
     moved = {**inputs, "projector.pattern": inputs["projector.pattern"] + change}
-    before, after = (float((scene.radiance(one, 3, 16) * weight).sum()) for one in (inputs, moved))
+    before, after = (float((scene.render_radiance(one, 3, 16) * weight).sum()) for one in (inputs, moved))
     assert float((gradient * change).sum()) == pytest.approx(after - before, rel=ROUNDING)
 
 
@@ -121,7 +123,7 @@ def test_the_adjoint_is_the_difference() -> None:
 def test_a_black_picture_is_checked_at_grey() -> None:
     """At black there is a bend, of which differences to both sides see the half."""
     renderer = renderer_of()
-    assert not bool(renderer.start.any()) and bool((interior_point(renderer) == 0.5).all())
+    assert not bool(renderer.start.any()) and bool((find_interior_point(renderer) == 0.5).all())
 
 
 @pytest.mark.slow
@@ -137,12 +139,12 @@ def test_derivatives_along_smooth_patterns_are_those_of_differences(object: str,
     for number in range(6):
         change = 0.5 * float(pattern.mean()) * smooth(renderer, number).reshape(pattern.shape)
         gradients = [
-            scene.adjoint(inputs, weight, 10 * number + k, 64, wrt=["projector.pattern"])["projector.pattern"]
+            scene.render_adjoint(inputs, weight, 10 * number + k, 64, wrt=["projector.pattern"])["projector.pattern"]
             for k in range(2)
         ]
         ours.append(float((torch.stack(gradients).mean(dim=0) * change).sum()))
         ends = [{**inputs, "projector.pattern": pattern + sign * change} for sign in (-0.5, 0.5)]
-        low, high = (float((scene.radiance(one, 1000 + number, 256) * weight).sum()) for one in ends)
+        low, high = (float((scene.render_radiance(one, 1000 + number, 256) * weight).sum()) for one in ends)
         theirs.append(high - low)
     cosine = float(nn.functional.cosine_similarity(torch.tensor(ours), torch.tensor(theirs), dim=0))
     assert cosine > 0.99, (ours, theirs)
@@ -152,9 +154,9 @@ def test_derivatives_along_smooth_patterns_are_those_of_differences(object: str,
 @pytest.mark.parametrize("object", ["mug", "stop-sign"])
 def test_the_matrix_predicts_what_is_traced(object: str) -> None:
     renderer = renderer_of(object, "studio", side=24)
-    assert why_not(renderer) is None
-    linear = predicting(renderer, renderer.start, seed=1)
-    assert isinstance(linear, LinearRenderer) and linear.entries > 100
+    assert find_refusal(renderer) is None
+    linear = make_predictor(renderer, renderer.start, seed=1)
+    assert isinstance(linear, LinearRenderer) and linear.n_entries > 100
     u = (0.5 + 0.2 * smooth(renderer, 1)).clamp(0.0, 1.0)
     before, after = (renderer.radiance(one, seed=7, spp=1024) for one in (renderer.start, u))
     predicted = [linear.renderer.radiance(one) for one in (renderer.start, u)]
@@ -172,7 +174,7 @@ def test_beside_moving_lamps_and_textures_its_light_counts_once() -> None:
         make_control("texture", {"resolution": 8}),
     ]
     renderer = scene.renderer(controls, resolution=24)
-    basis = predicting(renderer, renderer.start, seed=1)
+    basis = make_predictor(renderer, renderer.start, seed=1)
     assert isinstance(basis, BasisRenderer)
     u = renderer.start.clone()
     u[: 8 * 8 * 3] = 0.6
@@ -185,7 +187,7 @@ def test_beside_moving_lamps_and_textures_its_light_counts_once() -> None:
 def test_the_stored_png_throws_the_same_picture_and_texels_have_eight_bits(tmp_path: Path) -> None:
     renderer = renderer_of()
     u = torch.rand(len(renderer.start), generator=torch.Generator().manual_seed(3))
-    pattern = space_of(renderer).artifacts(u)["projector"]
+    pattern = space_of(renderer).get_artifact_images(u)["projector"]
     file = write_png(tmp_path / "pattern.png", pattern)
     assert torch.equal(torch.from_numpy(read_png(file)), pattern)
     (thrown,) = space_of(renderer).controls
@@ -276,7 +278,7 @@ def test_the_result_says_in_which_ambient_light_it_ends(glare: advsearch.Model, 
         verify_spp=16, baseline=False, measure="no", run=tmp_path / "run",
     )  # fmt: skip
     light = result.summary.ambient
-    assert result.found and light is not None and light.lux == AMBIENT
+    assert result.found and light is not None and light.lux == DEFAULT_AMBIENT_LUX
     assert [point.lux for point in light.points] == sorted(point.lux for point in light.points)
     assert light.points[0].verified == result.summary.verified
     assert light.ends_at is not None and light.lux < light.ends_at <= 1.2 * light.holds_to
@@ -297,7 +299,9 @@ def test_the_export_has_the_picture_marks_and_what_to_set(tmp_path: Path) -> Non
     notes = write_projection(run, tmp_path / "out")
     assert "10 lumens" in notes[0]
     texels = torch.from_numpy(read_png(tmp_path / "out" / "texels.png"))
-    assert torch.equal(texels, space_of(renderer_of(**settings)).artifacts(torch.from_numpy(u).float())["projector"])
+    assert torch.equal(
+        texels, space_of(renderer_of(**settings)).get_artifact_images(torch.from_numpy(u).float())["projector"]
+    )
     marks, seen = (read_png(tmp_path / "out" / name) for name in ("marks.png", "seen.png"))
     assert marks.max() == 1.0 and marks.mean() < 0.1 and seen.shape == (16, 16, 3)
     assert {one.name for one in (tmp_path / "out").iterdir()} == {

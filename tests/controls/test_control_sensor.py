@@ -8,16 +8,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls.sensor import SensorControl, aberrated, demosaiced, through_sensor
+from advsearch.controls.sensor import SensorControl, apply_aberration, apply_mosaic, apply_sensor
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 
 NAMES = ("vignetting", "aberration", "shot", "read", "mosaic", "red", "blue", "compression")
 
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 def values(**given: float) -> dict[str, Tensor]:
@@ -31,14 +31,14 @@ def random_picture(height: int, width: int) -> Tensor:
 def test_the_start_is_the_picture_as_it_is(scene: SceneDescription) -> None:
     bound = SensorControl().bind(scene)
     image = random_picture(24, 32)
-    assert float((bound.picture(bound.start, image) - image).abs().max()) < 2e-5
+    assert float((bound.apply_to_image(bound.start, image) - image).abs().max()) < 2e-5
 
 
 @pytest.mark.parametrize(("shot", "read"), [(0.1, 0.0), (0.0, 0.05), (0.1, 0.05)])
 @pytest.mark.parametrize("light", [0.1, 0.5])
 def test_noise_has_a_variance_that_is_affine_in_the_light(shot: float, read: float, light: float) -> None:
     image = linear_to_srgb(torch.full((200, 200, 3), light))
-    noise = srgb_to_linear(through_sensor(image, values(shot=shot, read=read))) - light
+    noise = srgb_to_linear(apply_sensor(image, values(shot=shot, read=read))) - light
     expected = math.sqrt(shot**2 * light + read**2)
     assert float(noise.std()) == pytest.approx(expected, rel=0.05)
     assert abs(float(noise.mean())) < 0.05 * expected
@@ -46,15 +46,15 @@ def test_noise_has_a_variance_that_is_affine_in_the_light(shot: float, read: flo
 
 def test_the_draw_of_the_noise_is_chosen_by_the_seed() -> None:
     image = torch.full((16, 16, 3), 0.5)
-    draws = [through_sensor(image, values(read=0.05), seed) for seed in (0, 0, 1)]
+    draws = [apply_sensor(image, values(read=0.05), seed) for seed in (0, 0, 1)]
     assert torch.equal(draws[0], draws[1]) and not torch.equal(draws[0], draws[2])
 
 
 def test_a_mosaic_keeps_what_is_smooth_and_the_pixels_that_it_has() -> None:
     ramp = torch.linspace(0.0, 1.0, 33)[None, :, None].expand(17, 33, 3)
-    torch.testing.assert_close(demosaiced(ramp)[1:-1, 1:-1], ramp[1:-1, 1:-1])
+    torch.testing.assert_close(apply_mosaic(ramp)[1:-1, 1:-1], ramp[1:-1, 1:-1])
     picture = random_picture(16, 16)
-    seen = demosaiced(picture)
+    seen = apply_mosaic(picture)
     assert torch.equal(seen[0::2, 0::2, 0], picture[0::2, 0::2, 0])
     assert torch.equal(seen[1::2, 0::2, 1], picture[1::2, 0::2, 1])
     assert torch.equal(seen[1::2, 1::2, 2], picture[1::2, 1::2, 2])
@@ -64,7 +64,7 @@ def test_a_mosaic_keeps_what_is_smooth_and_the_pixels_that_it_has() -> None:
 
 def test_a_fine_black_and_white_pattern_gets_colours() -> None:
     stripes = (torch.arange(32) % 2).float()[None, :, None].expand(32, 32, 3)
-    seen = through_sensor(stripes, values(mosaic=1.0))
+    seen = apply_sensor(stripes, values(mosaic=1.0))
     assert float((seen[..., 0] - seen[..., 2]).abs().mean()) > 0.2
 
 
@@ -72,7 +72,7 @@ def test_red_is_larger_and_blue_smaller() -> None:
     dot = torch.zeros(101, 101, 3)
     dot[50, 90] = 1.0
     columns = torch.arange(101.0)
-    red, green, blue = (aberrated(dot, torch.tensor(0.02))[50].T * columns).sum(dim=1) / aberrated(
+    red, green, blue = (apply_aberration(dot, torch.tensor(0.02))[50].T * columns).sum(dim=1) / apply_aberration(
         dot, torch.tensor(0.02)
     )[50].T.sum(dim=1)
     assert float(green) == pytest.approx(90.0)
@@ -85,19 +85,19 @@ def test_light_falls_with_the_fourth_power_of_the_cosine_of_the_angle() -> None:
     down, across = (torch.arange(side) + 0.5 - side / 2 for side in (40, 60))
     cosine = 35.0 / torch.sqrt(35.0**2 + down[:, None] ** 2 + across[None, :] ** 2)
     missing = 1.0 - (35.0 / math.sqrt(35.0**2 + 20.0**2 + 30.0**2)) ** 4
-    seen = srgb_to_linear(through_sensor(linear_to_srgb(torch.full((40, 60, 3), 0.8)), values(vignetting=missing)))
+    seen = srgb_to_linear(apply_sensor(linear_to_srgb(torch.full((40, 60, 3), 0.8)), values(vignetting=missing)))
     torch.testing.assert_close(seen, 0.8 * (cosine**4)[..., None].expand(40, 60, 3), atol=1e-4, rtol=0)
 
 
 def test_white_balance_is_in_stops() -> None:
     image = linear_to_srgb(torch.full((4, 4, 3), 0.2))
-    seen = srgb_to_linear(through_sensor(image, values(red=1.0, blue=-1.0)))[0, 0]
+    seen = srgb_to_linear(apply_sensor(image, values(red=1.0, blue=-1.0)))[0, 0]
     torch.testing.assert_close(seen, torch.tensor([0.4, 0.2, 0.1]), atol=1e-3, rtol=0)
 
 
 def test_compression_is_a_jpeg_file_and_its_derivative_that_of_the_picture() -> None:
     image = random_picture(16, 16).requires_grad_()
-    mild, strong = (through_sensor(image, values(compression=c)) for c in (5.0, 90.0))
+    mild, strong = (apply_sensor(image, values(compression=c)) for c in (5.0, 90.0))
     assert 1e-3 < float((mild - image).detach().abs().mean()) < float((strong - image).detach().abs().mean())
     strong.sum().backward()
     assert image.grad is not None and float((image.grad - 1.0).abs().median()) < 1e-3
@@ -110,7 +110,7 @@ def test_the_derivatives_are_those_of_differences() -> None:
     tensors = [torch.tensor(one, dtype=torch.float64, requires_grad=True) for one in inside]
 
     def seen(picture: Tensor, *numbers: Tensor) -> Tensor:
-        return through_sensor(picture, {**dict(zip(NAMES, numbers, strict=False)), "compression": torch.tensor(0.0)})
+        return apply_sensor(picture, {**dict(zip(NAMES, numbers, strict=False)), "compression": torch.tensor(0.0)})
 
     assert torch.autograd.gradcheck(seen, (image.requires_grad_(), *tensors), eps=1e-7, atol=1e-4)
 
@@ -123,7 +123,7 @@ def test_extreme_values_give_finite_pictures_and_derivatives(
     bound = SensorControl().bind(scene)
     u = torch.full_like(bound.start, share).requires_grad_()
     image = torch.full((9, 13, 3), grey, requires_grad=True)
-    seen = bound.picture(u, image)
+    seen = bound.apply_to_image(u, image)
     seen.sum().backward()
     assert float(seen.detach().min()) >= 0.0 and float(seen.detach().max()) <= 1.0
     assert u.grad is not None and image.grad is not None

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.controls import make_control
-from advsearch.controls.shadow import strongest_light
+from advsearch.controls.shadow import find_strongest_light
 from advsearch.controls.space import Space
-from advsearch.scene.description import describe
-from advsearch.scene.geometry import camera_to_world, middle
-from advsearch.scene.parts import polygon
+from advsearch.scene.description import load_description
+from advsearch.scene.geometry import camera_to_world, compute_center
+from advsearch.scene.parts import make_polygon
 from advsearch.scene.renderer import Renderer
 
 SIDE = 32
@@ -61,21 +61,21 @@ def test_it_is_out_of_sight_from_wherever_it_stands_or_put_away(azimuth: float, 
 
 
 def test_the_strongest_light_is_that_of_the_map_or_a_lamp() -> None:
-    low, far = strongest_light(describe("mug", "low-sun"))
+    low, far = find_strongest_light(load_description("mug", "low-sun"))
     assert math.isinf(far) and 0.0 < low[2] < 0.5 and np.linalg.norm(low) == pytest.approx(1.0, abs=1e-3)
-    turned, _ = strongest_light(describe("mug", "low-sun", given={"environment.rotation": 90.0}))
+    turned, _ = find_strongest_light(load_description("mug", "low-sun", given={"environment.rotation": 90.0}))
     assert turned[0] == pytest.approx(-low[1], abs=1e-6) and turned[1] == pytest.approx(low[0], abs=1e-6)
 
 
 def test_the_card_is_a_polygon_that_faces_the_object() -> None:
-    card = polygon(5)
+    card = make_polygon(5)
     first, second, third = (card.vertices[card.faces[:, k]] for k in range(3))
     assert bool((np.cross(second - first, third - first)[:, 2] > 0.0).all())
     renderer = renderer_of(corners=5, size=0.5)
     inputs = renderer.space.inputs(torch.full_like(renderer.start, 0.25))
     pose, offsets = inputs["shadow.to_world"], inputs["shadow.offsets"]
-    scene = describe("mug", "noon")
-    towards = torch.from_numpy(middle(scene)).float() - pose[:3, 3]
+    scene = load_description("mug", "noon")
+    towards = torch.from_numpy(compute_center(scene)).float() - pose[:3, 3]
     assert float(pose[:3, 2] @ towards) > 0.0 and float(torch.linalg.det(pose[:3, :3])) > 0.0
     rim = torch.from_numpy(card.vertices) + offsets
     assert torch.allclose(rim[1:].norm(dim=1), torch.full((5,), 0.4), atol=1e-6)  # u of 0.25 in 0.2 to 1

@@ -12,21 +12,21 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.sky import (
-    COLUMNS,
+    MAP_COLUMNS,
+    MAP_ROWS,
     METERED_IRRADIANCE,
-    ROWS,
-    SUN_APERTURE,
+    REAL_SUN_RADIUS,
     Sky,
     SkyControl,
-    angle_between,
-    direction,
-    sun_irradiance,
+    compute_angles,
+    compute_direction,
+    compute_sun_irradiance,
 )
 from advsearch.errors import InputError
-from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.formation import irradiance
+from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.formation import compute_irradiance
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 
 PLUGIN_UNIT = 106.750
 """Mitsuba divides by the integral of the CIE luminosity function; maps here do not."""
@@ -36,7 +36,7 @@ SKIES = ((20.0, 45.0, 3.0, 1e-3), (200.0, 80.0, 10.0, 1e-3), (120.0, 12.0, 7.0, 
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 def numbers(*given: float) -> list[Tensor]:
@@ -45,7 +45,7 @@ def numbers(*given: float) -> list[Tensor]:
 
 def looked_up(emitter: Any, directions: np.ndarray) -> np.ndarray:
     """Radiance (N, 3) that a Mitsuba emitter sends from directions (N, 3)."""
-    mi = mitsuba()
+    mi = import_mitsuba()
     import drjit as dr
 
     interaction = dr.zeros(mi.SurfaceInteraction3f, len(directions))
@@ -55,8 +55,8 @@ def looked_up(emitter: Any, directions: np.ndarray) -> np.ndarray:
 
 
 def plugin(azimuth: float, elevation: float, turbidity: float, **scales: float) -> Any:
-    sun = direction(*numbers(azimuth, elevation)).tolist()
-    return mitsuba().load_dict(
+    sun = compute_direction(*numbers(azimuth, elevation)).tolist()
+    return import_mitsuba().load_dict(
         {"type": "sunsky", "sun_direction": sun, "turbidity": turbidity, "albedo": 0.3, **scales}
     )
 
@@ -64,7 +64,7 @@ def plugin(azimuth: float, elevation: float, turbidity: float, **scales: float) 
 @pytest.mark.parametrize(("azimuth", "elevation", "turbidity", "within"), SKIES)
 def test_the_dome_is_mitsubas(azimuth: float, elevation: float, turbidity: float, within: float) -> None:
     sky = Sky(torch.full((3,), 0.3))
-    own = sky.dome(direction(*numbers(azimuth, elevation)), *numbers(elevation, turbidity))
+    own = sky.compute_dome(compute_direction(*numbers(azimuth, elevation)), *numbers(elevation, turbidity))
     reference = looked_up(plugin(azimuth, elevation, turbidity, sun_scale=0.0), sky.directions.reshape(-1, 3).numpy())
     assert np.allclose(own.reshape(-1, 3).numpy(), reference * PLUGIN_UNIT, rtol=within)
 
@@ -72,17 +72,19 @@ def test_the_dome_is_mitsubas(azimuth: float, elevation: float, turbidity: float
 @pytest.mark.parametrize(("azimuth", "elevation", "turbidity", "within"), SKIES)
 def test_the_suns_light_is_mitsubas(azimuth: float, elevation: float, turbidity: float, within: float) -> None:
     count = 2000
-    sun = direction(*numbers(azimuth, elevation)).double().numpy()
+    sun = compute_direction(*numbers(azimuth, elevation)).double().numpy()
     across = np.cross(sun, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
-    radius = np.tan(SUN_APERTURE * 0.9999) * np.sqrt((np.arange(count) + 0.5) / count)
+    radius = np.tan(REAL_SUN_RADIUS * 0.9999) * np.sqrt((np.arange(count) + 0.5) / count)
     angle = np.arange(count) * math.pi * (3.0 - math.sqrt(5.0))
     sideways = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(sun, across)
     directions = sun + radius[:, None] * sideways
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     disk = looked_up(plugin(azimuth, elevation, turbidity, sky_scale=0.0), directions)
-    reference = disk.mean(axis=0) * math.pi * SUN_APERTURE**2 * PLUGIN_UNIT
-    assert np.allclose(sun_irradiance(*numbers(elevation, turbidity)).numpy(), reference, rtol=max(0.01, within))
+    reference = disk.mean(axis=0) * math.pi * REAL_SUN_RADIUS**2 * PLUGIN_UNIT
+    assert np.allclose(
+        compute_sun_irradiance(*numbers(elevation, turbidity)).numpy(), reference, rtol=max(0.01, within)
+    )
 
 
 @pytest.mark.parametrize("turbidity", [3.0, 4.0, 7.5])
@@ -100,11 +102,11 @@ def test_the_derivative_of_turbidity_is_the_same_from_both_sides(turbidity: floa
 
 @pytest.mark.parametrize("azimuth", [0.0, 90.0, 215.0])
 def test_the_sun_stands_where_it_is_asked_to(azimuth: float) -> None:
-    scene = describe("mug")
+    scene = load_description("mug")
     control = SkyControl(azimuth=azimuth, elevation=[30, 31])
     emitter = MitsubaScene(control.prepare(scene), (8, 8))._scene.environment()
-    sun = direction(*numbers(azimuth, 30.0)).double().numpy()
-    aside = direction(*numbers(azimuth + 8.0, 30.0)).double().numpy()
+    sun = compute_direction(*numbers(azimuth, 30.0)).double().numpy()
+    aside = compute_direction(*numbers(azimuth + 8.0, 30.0)).double().numpy()
     at_sun, beside = looked_up(emitter, np.stack([sun, aside])).mean(axis=1)
     assert at_sun > 100.0 * beside > 0.0
 
@@ -112,18 +114,18 @@ def test_the_sun_stands_where_it_is_asked_to(azimuth: float) -> None:
 def test_the_map_keeps_the_suns_light_and_the_ground_reflects_it() -> None:
     ground = torch.tensor([0.4, 0.3, 0.1])
     sky = Sky(ground)
-    sun = direction(*numbers(40.0, 35.0))
-    total = (sky.disk(sun) * sky.solid_angles).sum()
+    sun = compute_direction(*numbers(40.0, 35.0))
+    total = (sky.compute_disk(sun) * sky.solid_angles).sum()
     assert float(total) == pytest.approx(1.0, rel=1e-5)
     radiance, _ = sky(*numbers(40.0, 35.0, 3.0))
-    assert radiance.shape == (ROWS, COLUMNS, 3) and float(radiance.min()) >= 0.0
-    arriving = (radiance[: ROWS // 2] * sky.solid_angles * sky.cosines).sum((0, 1))
+    assert radiance.shape == (MAP_ROWS, MAP_COLUMNS, 3) and float(radiance.min()) >= 0.0
+    arriving = (radiance[: MAP_ROWS // 2] * sky.solid_angles * sky.cosines).sum((0, 1))
     assert torch.allclose(radiance[-1, 0], ground * arriving / math.pi, rtol=1e-4)
 
 
 def strongest(scene: SceneDescription, radiance: np.ndarray) -> float:
     """Irradiance from above the horizon on the surface that gets most of it."""
-    above = np.concatenate([radiance[: ROWS // 2], np.zeros_like(radiance[ROWS // 2 :])])
+    above = np.concatenate([radiance[: MAP_ROWS // 2], np.zeros_like(radiance[MAP_ROWS // 2 :])])
     assert scene.environment is not None
     lit = replace(scene, environment=replace(scene.environment, radiance=above)).with_values(ground__size=0.0)
     steps = np.linspace(0.0, 2.0 * math.pi, 48, endpoint=False)
@@ -132,7 +134,7 @@ def strongest(scene: SceneDescription, radiance: np.ndarray) -> float:
         for up in steps[:13]
         for turn in steps
     ]
-    return float(irradiance(lit, np.array(normals)).mean(axis=1).max())
+    return float(compute_irradiance(lit, np.array(normals)).mean(axis=1).max())
 
 
 def test_every_sky_has_one_strength_unless_exposure_is_fixed(scene: SceneDescription) -> None:
@@ -169,12 +171,12 @@ def test_extreme_skies_are_finite_and_so_are_their_derivatives(elevation: float,
 def test_the_maps_derivatives_are_right(scene: SceneDescription) -> None:
     """A smooth weight over the map: autograd against differences of the map itself, in which there is no noise."""
     bound = SkyControl().bind(scene)
-    around = torch.linspace(0.0, 2.0 * math.pi, COLUMNS + 1)[None, :-1, None]
-    down = torch.linspace(0.0, math.pi, ROWS)[:, None, None]
+    around = torch.linspace(0.0, 2.0 * math.pi, MAP_COLUMNS + 1)[None, :-1, None]
+    down = torch.linspace(0.0, math.pi, MAP_ROWS)[:, None, None]
     weights = torch.sin(down) * torch.sin(down + around)
 
     def weighed(u: Tensor) -> Tensor:
-        return (bound.inputs(u)["environment.data"].double() * weights).sum() / COLUMNS
+        return (bound.inputs(u)["environment.data"].double() * weights).sum() / MAP_COLUMNS
 
     u = torch.tensor([0.3, 0.4, 0.45], requires_grad=True)
     weighed(u).backward()
@@ -189,7 +191,7 @@ def test_the_maps_derivatives_are_right(scene: SceneDescription) -> None:
 def test_angles_are_right_and_differentiable_everywhere() -> None:
     towards = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
     there = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-    angles = angle_between(there, towards)
+    angles = compute_angles(there, towards)
     assert angles.tolist() == pytest.approx([0.0, math.pi, math.pi / 2.0], abs=1e-5)
     angles.sum().backward()
     assert towards.grad is not None and bool(torch.isfinite(towards.grad).all())
@@ -204,11 +206,14 @@ def test_the_adjoint_of_turbidity_agrees_with_differences(scene: SceneDescriptio
     weights = torch.linspace(0.0, 1.0, 32)[:, None, None].expand(32, 32, 3).contiguous()
     u = torch.tensor([0.55], requires_grad=True)
     inputs = mitsuba_scene.assembly(bound.inputs(u))
-    found = mitsuba_scene.adjoint({name: one.detach() for name, one in inputs.items()}, weights, 1, 128)
+    found = mitsuba_scene.render_adjoint({name: one.detach() for name, one in inputs.items()}, weights, 1, 128)
     sum((inputs[name] * one).sum() for name, one in found.items()).backward()  # type: ignore[union-attr]
     above, below = (
         float(
-            (mitsuba_scene.radiance(mitsuba_scene.assembly(bound.inputs(torch.tensor([at]))), 2, 256) * weights).sum()
+            (
+                mitsuba_scene.render_radiance(mitsuba_scene.assembly(bound.inputs(torch.tensor([at]))), 2, 256)
+                * weights
+            ).sum()
         )
         for at in (0.65, 0.45)
     )

@@ -11,7 +11,7 @@ from torch import Tensor
 import advsearch
 from advsearch.controls import make_control
 from advsearch.controls.projector import ProjectorControl, SpotControl
-from advsearch.controls.projector.projector import out_of_focus
+from advsearch.controls.projector.projector import blur_light
 from advsearch.controls.space import Space
 from advsearch.scene.renderer import Renderer
 
@@ -33,13 +33,13 @@ def spot_of(renderer: Renderer) -> SpotControl:
 
 def raw(renderer: Renderer, u: Tensor) -> Tensor:
     """Radiance (H, W, 3) without the denoiser, at one seed."""
-    return renderer.scene.radiance(renderer.scene.assembly(renderer.space.inputs(u)), 1, 16)
+    return renderer.scene.render_radiance(renderer.scene.assembly(renderer.space.inputs(u)), 1, 16)
 
 
 @pytest.mark.medium
 def test_it_has_all_its_lumens_and_half_of_them_within_its_width() -> None:
     control = spot_of(renderer_of(width=0.3, x=0.1, lumens=[0, 10]))
-    thrown = control.thrown(control.values(torch.ones(1)))
+    thrown = control.project_light(control.values(torch.ones(1)))
     assert float(thrown.mean()) == pytest.approx(1.0, rel=1e-3)  # white of as many lumens has 1 everywhere
     half = float(thrown.max()) / 2.0
     far = float(control.values(torch.ones(1))["distance"]) / control.scene.metres
@@ -55,7 +55,7 @@ def test_it_only_adds_light_and_there_is_none_at_the_start() -> None:
     dark, lit = raw(renderer, renderer.start), raw(renderer, THERE)
     assert bool((lit >= dark - 1e-6).all()) and float((lit - dark).mean()) > 0.01
     told = spot_of(renderer).describe(renderer.start)
-    assert told["spot.lux"]["value"] == 0.0 and spot_of(renderer).moved == ()
+    assert told["spot.lux"]["value"] == 0.0 and spot_of(renderer).adjusted_defaults == ()
 
 
 @pytest.mark.medium
@@ -65,7 +65,7 @@ def test_the_adjoint_is_the_difference() -> None:
     weight = torch.randn(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(2))
     u = THERE.clone().requires_grad_()
     inputs = renderer.scene.assembly(renderer.space.inputs(u))
-    (gradient,) = renderer.scene.adjoint(
+    (gradient,) = renderer.scene.render_adjoint(
         {name: one.detach() for name, one in inputs.items()}, weight, 1, 16, wrt=["spot.pattern"]
     ).values()
     (slopes,) = torch.autograd.grad(inputs["spot.pattern"], u, gradient)
@@ -81,13 +81,13 @@ def test_out_of_focus_the_light_is_as_much_and_spreads() -> None:
     light = torch.zeros(32, 32, 3)
     light[16, 16] = 1.0
     blur = torch.tensor(2.0, requires_grad=True)
-    spread = out_of_focus(light, blur)
+    spread = blur_light(light, blur)
     assert float(spread.detach().sum()) == pytest.approx(3.0, rel=1e-4)
     away = (torch.arange(32) - 16.0) ** 2
     assert float((spread[..., 0].detach().sum(dim=0) * away).sum()) == pytest.approx(4.0, rel=0.02)
     (spread**2).sum().backward()
     assert blur.grad is not None and float(blur.grad) < 0.0
-    assert out_of_focus(light, torch.tensor(0.0)) is light
+    assert blur_light(light, torch.tensor(0.0)) is light
 
 
 @pytest.mark.medium
@@ -99,7 +99,7 @@ def test_a_flashing_light_is_on_in_half_of_each_period(kind: str) -> None:
     (control,) = renderer.space.controls
     assert isinstance(control, ProjectorControl)
     lit = [
-        float(control.later(seconds).inputs(control.start)[f"{kind}.pattern"].sum()) > 0.0
+        float(control.advance_time(seconds).inputs(control.start)[f"{kind}.pattern"].sum()) > 0.0
         for seconds in (0.0, 0.003, 0.005, 0.008, 0.0095, 0.012)
     ]
     assert lit == [True, True, False, False, True, True]

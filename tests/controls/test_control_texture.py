@@ -10,12 +10,12 @@ from torch import Tensor
 import advsearch
 from advsearch.controls import make_control, make_space
 from advsearch.controls.base import Control
-from advsearch.controls.texture import TextureControl, palette
+from advsearch.controls.texture import TextureControl, compute_palette
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import rasterised
+from advsearch.scene.raster import rasterize_charts
 
 EIGHT_BIT = 1e-4
 """Colours may differ by this much after the way to linear values and back."""
@@ -23,7 +23,7 @@ EIGHT_BIT = 1e-4
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug")
+    return load_description("mug")
 
 
 def texels(bound: Control, u: Tensor) -> Tensor:
@@ -91,13 +91,13 @@ def test_a_palette_repaints_what_resembles_its_colour() -> None:
     image[:, :4] = torch.tensor([0.8, 0.2, 0.2])
     image[:, 4:] = torch.tensor([0.2, 0.2, 0.8])
     image[0, 0] = torch.tensor([0.75, 0.2, 0.2])  # a shade of red
-    colors = palette(image, np.ones((8, 8), dtype=np.float32), 2)
+    colors = compute_palette(image, np.ones((8, 8), dtype=np.float32), 2)
     assert colors.shape == (2, 3)
     red = int(colors[:, 0].argmax())
     from advsearch.controls.base import Budget
-    from advsearch.controls.texture import recoloured
+    from advsearch.controls.texture import make_palette_painter
 
-    painter = recoloured(image, colors, Budget("linf", 0.5))
+    painter = make_palette_painter(image, colors, Budget("linf", 0.5))
     u = colors.clone()
     u[red] = torch.tensor([0.3, 0.7, 0.2])
     painted = painter.texels(u.reshape(-1))
@@ -108,9 +108,9 @@ def test_a_palette_repaints_what_resembles_its_colour() -> None:
 
 def test_the_palette_is_that_of_the_surface_and_never_by_chance(scene: SceneDescription) -> None:
     own = torch.from_numpy(scene.object.base_color.copy())
-    area = rasterised(scene.object.mesh, len(own)).areas()
-    first = palette(own, area, 6)
-    assert torch.equal(first, palette(own, area, 6)) and first.shape == (6, 3)
+    area = rasterize_charts(scene.object.mesh, len(own)).compute_areas()
+    first = compute_palette(own, area, 6)
+    assert torch.equal(first, compute_palette(own, area, 6)) and first.shape == (6, 3)
     cream, blue = torch.tensor([0.90, 0.85, 0.78]), torch.tensor([0.14, 0.37, 0.58])
     for wanted in (cream, blue):
         assert float((first - wanted).norm(dim=1).min()) < 0.08
@@ -120,7 +120,7 @@ def test_the_palette_is_that_of_the_surface_and_never_by_chance(scene: SceneDesc
 
 def test_a_plain_texture_has_one_colour_however_many_are_asked_for() -> None:
     plain = torch.full((8, 8, 3), 0.4)
-    found = palette(plain, np.ones((8, 8), dtype=np.float32), 6)
+    found = compute_palette(plain, np.ones((8, 8), dtype=np.float32), 6)
     torch.testing.assert_close(found, torch.full((1, 3), 0.4))
 
 
@@ -153,9 +153,9 @@ def test_another_mesh_of_the_scene_can_be_painted(scene: SceneDescription) -> No
 
 def test_settings_make_the_same_control_again() -> None:
     control = TextureControl(form="waves", waves=5, name="texture:post")
-    again = make_control("texture:post", control.settings())
-    assert again.settings() == control.settings() and again.name == control.name
-    assert make_control("texture.palette").settings() == {"palette": [0.0, 1.0]}
+    again = make_control("texture:post", control.to_settings())
+    assert again.to_settings() == control.to_settings() and again.name == control.name
+    assert make_control("texture.palette").to_settings() == {"palette": [0.0, 1.0]}
     assert TextureControl(palette=[0.0, 1.0]).form == "palette"
 
 

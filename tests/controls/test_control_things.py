@@ -12,10 +12,10 @@ import torch
 import advsearch
 from advsearch.controls import Space, compose, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.sweep.axes import on_grid, read_axes
+from advsearch.questions.sweep.axes import add_grid_axes, parse_axes
 from advsearch.scene.assembly import Assembly
-from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.geometry import footprint, overlapping
+from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.geometry import compute_footprint, is_overlapping
 from advsearch.scene.parts import Footprint
 
 pytestmark = pytest.mark.usefixtures("two_threads")
@@ -27,21 +27,21 @@ CLOSE = 2e-4
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("car", things=THINGS, given={"camera.distance": 9.0})
+    return load_description("car", things=THINGS, given={"camera.distance": 9.0})
 
 
 def test_a_thing_that_moves_stays_out_of_houses_and_posts() -> None:
-    street = describe("car", "avenue", things="person@-15,-6", given={"camera.distance": 9.0})
+    street = load_description("car", "avenue", things="person@-15,-6", given={"camera.distance": 9.0})
     space = space_of(street, {"x": [-0.1, 0.1], "y": [-12.0, 3.0], "heading": [0, 1]})
-    solids = [solid for part in street.around.values() for solid in part.solids]
+    solids = [solid for part in street.surrounding_meshes.values() for solid in part.solids]
     for u in torch.rand(40, len(space.start), generator=torch.Generator().manual_seed(1)):
         inputs = space.inputs(u)
         assert space.scene is not None
         mesh = space.scene.meshes["person"].mesh.vertices
         pose = inputs["person.to_world"].double().numpy()
-        taken = footprint(mesh @ pose[:3, :3].T + pose[:3, 3])
-        assert not any(overlapping(solid.footprint, taken) for solid in solids)
-    post = describe("car", "avenue", things="person@-15,-3.05")
+        taken = compute_footprint(mesh @ pose[:3, :3].T + pose[:3, 3])
+        assert not any(is_overlapping(solid.footprint, taken) for solid in solids)
+    post = load_description("car", "avenue", things="person@-15,-3.05")
     with pytest.raises(InputError, match="person stands in something else; put it elsewhere"):
         space_of(post, {"x": [-1.0, 1.0]})
 
@@ -56,7 +56,7 @@ def vertices(space: Space, u: torch.Tensor, name: str) -> np.ndarray:
     assert space.scene is not None
     assembly = Assembly(space.scene)
     placed = assembly(space.inputs(u)).get(f"{name}.vertices")
-    placed = assembly.meshes[name].place(None, None)[0] if placed is None else placed
+    placed = assembly.meshes[name].transform_mesh(None, None)[0] if placed is None else placed
     return np.asarray(placed.double().numpy()) * space.scene.metres
 
 
@@ -77,7 +77,7 @@ def test_at_its_start_all_stands_where_it_was_put(scene: SceneDescription) -> No
         f"{thing}.{parameter}" for thing in ("chair", "stop-sign", "car") for parameter in ("x", "y", "heading")
     ]
     for name in scene.things:
-        before = Assembly(scene).meshes[name].place(None, None)[0].double().numpy() * scene.metres
+        before = Assembly(scene).meshes[name].transform_mesh(None, None)[0].double().numpy() * scene.metres
         np.testing.assert_allclose(vertices(space, space.start, name), before, atol=CLOSE)
 
 
@@ -97,8 +97,8 @@ def test_where_it_stands_is_said_as_things_are_asked_for(scene: SceneDescription
     said = space.describe(u)
     x, y = (said[f"things.chair.at_{axis}"]["value"] for axis in "xy")
     assert said["things.chair.x"]["value"] == -2.0 and float(x) > 2.3
-    again = describe("car", things=f"chair@{x},{y},size=1,heading=40", given={"camera.distance": 9.0})
-    placed = Assembly(again).meshes["chair"].place(None, None)[0].double().numpy() * again.metres
+    again = load_description("car", things=f"chair@{x},{y},size=1,heading=40", given={"camera.distance": 9.0})
+    placed = Assembly(again).meshes["chair"].transform_mesh(None, None)[0].double().numpy() * again.metres
     np.testing.assert_allclose(vertices(space, u, "chair"), placed, atol=5e-3)  # the car's middle is not its box's foot
 
 
@@ -108,8 +108,8 @@ def test_nothing_stands_in_anything_else(scene: SceneDescription) -> None:
     pushed = 0
     for seed in range(60):
         u = torch.rand(len(space.start), generator=torch.Generator().manual_seed(seed))
-        prints = {name: footprint(vertices(space, u, name)) for name in ("object", *scene.things)}
-        assert not any(overlapping(prints[one], prints[other]) for one, other in combinations(prints, 2)), seed
+        prints = {name: compute_footprint(vertices(space, u, name)) for name in ("object", *scene.things)}
+        assert not any(is_overlapping(prints[one], prints[other]) for one, other in combinations(prints, 2)), seed
         assert torch.equal(space.inputs(u)["car.to_world"], space.inputs(u.clone())["car.to_world"])
         said = {name: float(one["value"]) for name, one in space.describe(u).items()}
         put = {"chair": 4.0, "stop-sign": 4.5, "car": -6.0}
@@ -119,10 +119,10 @@ def test_nothing_stands_in_anything_else(scene: SceneDescription) -> None:
 
 def test_it_is_moved_no_farther_than_it_takes(scene: SceneDescription) -> None:
     space = space_of(scene)
-    placed = footprint(vertices(space, at(space, chair_x=-2.0), "chair"))
-    car = footprint(vertices(space, space.start, "object"))
-    nearer = Footprint(placed.outline - [0.02, 0.0], placed.low, placed.high)
-    assert overlapping(nearer, car) and not overlapping(placed, car)
+    placed = compute_footprint(vertices(space, at(space, chair_x=-2.0), "chair"))
+    car = compute_footprint(vertices(space, space.start, "object"))
+    nearer = Footprint(placed.outline - [0.02, 0.0], placed.lower, placed.upper)
+    assert is_overlapping(nearer, car) and not is_overlapping(placed, car)
 
 
 @pytest.mark.medium
@@ -132,24 +132,24 @@ def test_the_object_and_other_things_may_be_moved_by_other_controls(scene: Scene
     space = space_of(scene, {"stop-sign.x": [-2, 2], "stop-sign.y": [-2, 2]}, **others)
     for seed in range(20):
         u = torch.rand(len(space.start), generator=torch.Generator().manual_seed(seed))
-        prints = {name: footprint(vertices(space, u, name)) for name in ("object", "chair", "stop-sign")}
-        assert not any(overlapping(prints["stop-sign"], prints[other]) for other in ("object", "chair"))
+        prints = {name: compute_footprint(vertices(space, u, name)) for name in ("object", "chair", "stop-sign")}
+        assert not any(is_overlapping(prints["stop-sign"], prints[other]) for other in ("object", "chair"))
     with pytest.raises(InputError, match=r"two controls set chair.to_world, pose:chair and things"):
         space_of(scene, **{"pose:chair": {"y": [0.0, 1.0]}}).inputs(torch.full((10,), 0.5))
 
 
 def test_nothing_stands_where_the_camera_is() -> None:
-    scene = describe(
+    scene = load_description(
         "car", things="car@11,5", given={"camera.distance": 11.0, "camera.azimuth": 0.0, "camera.elevation": 3.0}
     )
     space = space_of(scene, {"y": [-5.0, 0.0]})
-    placed = footprint(vertices(space, torch.tensor([0.0]), "car"))
+    placed = compute_footprint(vertices(space, torch.tensor([0.0]), "car"))
     assert placed.outline[:, 0].min() > 11.0 and np.abs(placed.outline[:, 1].mean()) < 0.2
 
 
 @pytest.mark.medium
 def test_on_a_pavement_it_stands_as_high_as_that() -> None:
-    scene = describe("car", "avenue", things="person@6,-1")
+    scene = load_description("car", "avenue", things="person@6,-1")
     space = space_of(scene, {"y": [-3.0, 0.0]})
     low = [vertices(space, torch.tensor([share]), "person")[:, 2].min() for share in (1.0, 0.0)]
     assert low == pytest.approx([0.0, 0.12], abs=CLOSE)
@@ -169,7 +169,7 @@ def test_what_is_away_is_neither_seen_nor_in_the_way_and_throws_no_shadow() -> N
     there, away, without = pictures
     assert 8.0 * float((away - without).abs().mean()) < float((there - without).abs().mean())  # the rest is noise
     assert "chair" not in seen[0]
-    scene = describe("car", things="chair@4,0,size=1; stop-sign@4,2")
+    scene = load_description("car", things="chair@4,0,size=1; stop-sign@4,2")
     space = make_space(
         [make_control("things", {"chair.presence": ["there", "away"], "stop-sign.y": [-2, -1.99]})], scene
     )
@@ -189,31 +189,31 @@ def test_a_setting_is_for_all_things_or_for_one(scene: SceneDescription) -> None
 
 
 def test_a_grid_may_be_of_one_thing(scene: SceneDescription) -> None:
-    axes = read_axes({"things.chair.heading": "0:315:8", "things.stop-sign.presence": ["there", "away"]}, ())
+    axes = parse_axes({"things.chair.heading": "0:315:8", "things.stop-sign.presence": ["there", "away"]}, ())
     assert [(axis.name, len(axis.values)) for axis in axes] == [
         ("things.chair.heading", 8),
         ("things.stop-sign.presence", 2),
     ]
-    space = make_space(on_grid((), axes, scene), scene)
+    space = make_space(add_grid_axes((), axes, scene), scene)
     assert [group.name for group in space.groups] == ["things.chair.heading", "things.stop-sign.presence"]
     with pytest.raises(UnknownNameError, match=r"parameter of control things .chair.hight"):
-        read_axes({"things.chair.hight": "0:1:2"}, ())
+        parse_axes({"things.chair.hight": "0:1:2"}, ())
 
 
 def test_what_cannot_be_is_refused(scene: SceneDescription) -> None:
     with pytest.raises(InputError, match="nothing stands beside the object; add `things`"):
-        space_of(describe("car"))
+        space_of(load_description("car"))
     with pytest.raises(UnknownNameError, match="chiar"):
         space_of(scene, {"chiar.x": [0, 1]})
     with pytest.raises(UnknownNameError, match="hight"):
         make_control("things", {"chair.hight": [0, 1]})
     with pytest.raises(InputError, match="chair stands in something else; put it elsewhere"):
-        space_of(describe("car", things="chair@1,0,size=1"))
+        space_of(load_description("car", things="chair@1,0,size=1"))
 
 
 def test_beside_a_small_thing_the_search_stays_near() -> None:
     for name, things, reach in (("mug", "bottle@0.3,0.1", 0.11), ("car", "chair@6,0,size=1", 2.0)):
-        scene = describe(name, things=things)
+        scene = load_description(name, things=things)
         space = make_space([make_control("things")], scene)
         u = space.start.clone()
         u[0] = 1.0

@@ -12,7 +12,7 @@ from advsearch import load_scene
 from advsearch.controls import CONTROLS, Control, TextureControl, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import describe
+from advsearch.scene.description import load_description
 from advsearch.scene.gradients import ESTIMATORS
 from advsearch.scene.settings import SETTINGS
 from conftest import ROOT
@@ -32,14 +32,14 @@ BESIDE = "bottle@0.4,0.1; vase@-0.3,0.3"
 def bound(kind: str, object: str = "mug") -> Control:
     """A control with its defaults in a scene, alone."""
     return make_space(
-        [make_control(kind, NEEDED.get(kind))], describe(SUITS.get(kind, object), things=BESIDE)
+        [make_control(kind, NEEDED.get(kind))], load_description(SUITS.get(kind, object), things=BESIDE)
     ).controls[0]
 
 
 @every_control
 def test_a_control_declares_itself(kind: str) -> None:
     control = CONTROLS[kind]
-    parameters = control.declared(NEEDED.get(kind, {}))
+    parameters = control.declare_parameters(NEEDED.get(kind, {}))
     assert control.kind == kind and control.summary.endswith(".") and parameters
     for parameter in parameters:
         assert parameter.low < parameter.high and parameter.unit and parameter.description.endswith(".")
@@ -79,7 +79,9 @@ def test_a_bound_control_starts_inside_and_maps_differentiably(kind: str) -> Non
         begin += group.size
     u = inner.requires_grad_()
     picture = torch.rand(24, 24, 3, generator=torch.Generator().manual_seed(0))
-    total = sum((tensor.sin().sum() for tensor in control.inputs(u).values()), control.picture(u, picture).sin().sum())
+    total = sum(
+        (tensor.sin().sum() for tensor in control.inputs(u).values()), control.apply_to_image(u, picture).sin().sum()
+    )
     if not total.requires_grad:
         assert not any(set(group.valid) & {"adjoint", "image", "material"} for group in control.groups)
         return
@@ -99,7 +101,7 @@ def test_a_control_is_finite_in_every_corner(kind: str) -> None:
     picture = torch.rand(24, 24, 3, generator=torch.Generator().manual_seed(0))
     for corner in (torch.zeros_like(control.start), torch.ones_like(control.start)):
         u = corner.requires_grad_()
-        changed = control.picture(u, picture)
+        changed = control.apply_to_image(u, picture)
         assert float(changed.detach().min()) >= 0.0 and float(changed.detach().max()) <= 1.0
         outputs = [*control.inputs(u).values(), changed]
         assert all(bool(torch.isfinite(one).all()) for one in outputs)
@@ -122,8 +124,8 @@ def test_a_bound_control_says_its_configuration_in_values_with_units(kind: str) 
 @every_control
 def test_a_control_can_be_made_again_from_its_settings(kind: str) -> None:
     control = make_control(kind, NEEDED.get(kind))
-    again = make_control(kind, control.settings())
-    scene = describe(SUITS.get(kind, "mug"), things=BESIDE)
+    again = make_control(kind, control.to_settings())
+    scene = load_description(SUITS.get(kind, "mug"), things=BESIDE)
     first, second = (make_space([one], scene).controls[0] for one in (control, again))
     assert torch.equal(first.start, second.start) and first.groups == second.groups
 
@@ -131,7 +133,7 @@ def test_a_control_can_be_made_again_from_its_settings(kind: str) -> None:
 @pytest.mark.medium
 @pytest.mark.parametrize("kind", ["light", "projector", "spot", "shadow", "occlusion", "patch"])
 def test_two_of_a_kind_live_side_by_side(kind: str) -> None:
-    space = make_space([make_control(f"{kind}:one"), make_control(f"{kind}:two")], describe("mug"))
+    space = make_space([make_control(f"{kind}:one"), make_control(f"{kind}:two")], load_description("mug"))
     assert [control.name for control in space.controls] == ["one", "two"]
     u = torch.full_like(space.start, 0.4)
     both = space.inputs(u)
@@ -154,12 +156,12 @@ def test_names_and_settings_that_do_not_exist_are_explained() -> None:
         with pytest.raises(UnknownNameError, match=f"unknown setting of control light '{setting}'"):
             make_control("light", {setting: "x"})
     with pytest.raises(InputError, match="controls: every instance needs a name of its own"):
-        make_space([TextureControl(), TextureControl()], describe("mug"))
+        make_space([TextureControl(), TextureControl()], load_description("mug"))
     with pytest.raises(InputError, match=r"controls: two controls set object.base_color"):
-        space = make_space([TextureControl(), TextureControl(name="second")], describe("mug"))
+        space = make_space([TextureControl(), TextureControl(name="second")], load_description("mug"))
         space.inputs(space.start)
     with pytest.raises(InputError, match="controls: expected at least one"):
-        make_space([], describe("mug"))
+        make_space([], load_description("mug"))
 
 
 @pytest.mark.parametrize("epsilon", [0.0, -0.1, math.nan, math.inf])
@@ -176,7 +178,7 @@ def test_other_settings_out_of_range_are_refused() -> None:
 
 
 def test_the_texture_starts_as_the_objects_own_and_is_linearised() -> None:
-    scene = describe("mug")
+    scene = load_description("mug")
     bound = TextureControl().bind(scene)
     own = torch.from_numpy(scene.object.base_color.copy())
     assert torch.equal(bound.start.reshape(own.shape), own)
@@ -185,7 +187,7 @@ def test_the_texture_starts_as_the_objects_own_and_is_linearised() -> None:
 
 
 def test_the_resolution_is_a_choice_and_keeps_the_mean() -> None:
-    scene = describe("mug")
+    scene = load_description("mug")
     bound = TextureControl(resolution=32).bind(scene)
     assert bound.start.numel() == 32 * 32 * 3
     assert float(bound.start.mean()) == pytest.approx(float(scene.object.base_color.mean()), abs=0.01)
@@ -193,7 +195,8 @@ def test_the_resolution_is_a_choice_and_keeps_the_mean() -> None:
 
 def test_the_default_balls_reach_the_same_root_mean_square() -> None:
     linf, l2 = (
-        TextureControl(norm=norm, resolution=32).bind(describe("mug")).groups[0].budget for norm in ("linf", "l2")
+        TextureControl(norm=norm, resolution=32).bind(load_description("mug")).groups[0].budget
+        for norm in ("linf", "l2")
     )
     assert linf.epsilon is not None and l2.epsilon is not None
     assert l2.epsilon == pytest.approx(linf.epsilon * math.sqrt(32 * 32 * 3))

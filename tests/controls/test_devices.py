@@ -9,7 +9,7 @@ import torch
 
 import advsearch
 from advsearch.controls import CONTROLS, compose, make_control
-from advsearch.controls.corruption import NAMES
+from advsearch.controls.corruption import CORRUPTION_NAMES
 from conftest import ROOT
 from elsewhere import ELSEWHERE, Away, elsewhere
 
@@ -34,7 +34,7 @@ FORMS: dict[str, tuple[dict[str, Any], ...]] = {
     "sensor": ({"shot": [0.0, 0.2], "mosaic": [0, 1], "compression": [0, 80], "aberration": [0.0, 0.02]},),
     "mitsuba": ({"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]},),
     "corruption": tuple(
-        {"which": which, "severity": severity} for which in NAMES for severity in ([0.2, 0.9], [3.2, 4.9])
+        {"which": which, "severity": severity} for which in CORRUPTION_NAMES for severity in ([0.2, 0.9], [3.2, 4.9])
     ),
 }
 """Settings under which a control takes all its ways; it is tried with none where it is not here."""
@@ -55,10 +55,10 @@ def test_what_a_control_gives_lies_where_the_searchs_numbers_do(kind: str, given
     space = compose((make_control(kind, given),), scene)
     u = (0.25 * space.start + 0.5).clamp(0.0, 1.0)
     image = torch.full((8, 8, 3), 0.5)
-    expected, seen = space.inputs(u), space.picture(u, image)
+    expected, seen = space.inputs(u), space.apply_to_image(u, image)
     with elsewhere():
         moved, away = u.to(ELSEWHERE), image.to(ELSEWHERE)
-        found, picture = space.inputs(moved), space.picture(moved, away)
+        found, picture = space.inputs(moved), space.apply_to_image(moved, away)
         said = space.describe(moved)
     assert {name for name, one in found.items() if not isinstance(one, Away)} == set()
     for name, one in found.items():

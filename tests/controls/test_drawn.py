@@ -14,14 +14,13 @@ from scipy import stats
 from torch.distributions import Beta, Exponential, Gumbel, Kumaraswamy, LogNormal, Normal, Uniform
 from torch.distributions import Laplace as TorchLaplace
 
-from advsearch.attacks.domain import Draws
+from advsearch.attacks.domain import SampleSequence
 from advsearch.controls import CameraControl, EnvironmentControl, PatchControl
 from advsearch.controls.base import NumberControl
-from advsearch.controls.ranges import DrawnRange
-from advsearch.distributions import as_setting
-from advsearch.engine.loading import as_controls, load_scene, only_here, settings_of
+from advsearch.controls.ranges import DistributionRange
+from advsearch.distributions import distribution_to_setting
+from advsearch.engine.loading import controls_to_settings, list_session_only_controls, load_scene, make_controls
 from advsearch.errors import InputError
-from advsearch.questions.attack.carry_out import controls_given
 from advsearch.questions.attack.settings import AttackConfig
 
 MUG = load_scene("mug").description
@@ -48,7 +47,7 @@ def azimuths(given: Any, shares: np.ndarray) -> np.ndarray:
     ],
 )
 def test_what_a_file_says_of_a_distribution(given: Any, setting: Any) -> None:
-    assert as_setting(given) == setting
+    assert distribution_to_setting(given) == setting
     assert json.loads(json.dumps(setting)) == setting
 
 
@@ -65,15 +64,22 @@ def test_torchs_distributions_are_scipys_of_other_names(distribution: torch.dist
     torch.manual_seed(0)
     drawn = distribution.sample((40_000,)).double().numpy()
     spec = CameraControl(azimuth=distribution).specs["azimuth"]
-    assert isinstance(spec, DrawnRange)
+    assert isinstance(spec, DistributionRange)
     for share in (0.1, 0.5, 0.9):
-        value = float(spec.at(torch.tensor([(share - spec.least) / (spec.most - spec.least)], dtype=torch.float64)))
+        value = float(
+            spec.interpolate(
+                torch.tensor(
+                    [(share - spec.lower_probability) / (spec.upper_probability - spec.lower_probability)],
+                    dtype=torch.float64,
+                )
+            )
+        )
         assert abs((drawn < value).mean() - share) < 0.01
 
 
 def test_even_draws_of_u_have_the_distribution_and_stay_even() -> None:
     """Sobol points stay a net: what they draw is nearer to the distribution than independent draws could be."""
-    points = Draws(1, "sobol", 0).points(0, 512)[:, 0]
+    points = SampleSequence(1, "sobol", 0).points(0, 512)[:, 0]
     found = azimuths(Normal(30.0, 10.0), points)
     assert stats.kstest(found, stats.norm(30, 10).cdf).statistic < 0.005
     assert abs(found.mean() - 30.0) < 0.1 and abs(found.std() - 10.0) < 0.1
@@ -101,7 +107,7 @@ def test_a_family_of_ones_own_is_not_scipys_of_the_same_name() -> None:
 def test_an_endless_tail_is_left_out_on_both_sides() -> None:
     """Also where a parameter's bound is far beyond it: 4.75 deviations."""
     spec = CameraControl(exposure=Normal(0.0, 0.5)).specs["exposure"]
-    assert isinstance(spec, DrawnRange) and (spec.low, spec.high) == pytest.approx((-2.377, 2.377), abs=1e-3)
+    assert isinstance(spec, DistributionRange) and (spec.low, spec.high) == pytest.approx((-2.377, 2.377), abs=1e-3)
 
 
 def test_the_clean_scene_has_its_value_where_the_distribution_has_it() -> None:
@@ -176,20 +182,20 @@ def test_a_search_refuses_what_says_how_likely_values_are() -> None:
     given = {"camera": {"azimuth": NORM}}
     config = AttackConfig(object="mug", controls=given)
     with pytest.raises(InputError, match=r"camera.azimuth: .* put it into `over`"):
-        controls_given(config, given, {})
-    drawn = controls_given(AttackConfig(object="mug", controls={"pose": {}}, over=given), {"pose": {}}, given)[1]
+        make_controls(config, given, {})
+    drawn = make_attack_controls(AttackConfig(object="mug", controls={"pose": {}}, over=given), {"pose": {}}, given)[1]
     assert [one.name for one in drawn] == ["camera"]
 
 
 def test_a_run_says_what_only_python_has_and_repeats_the_rest() -> None:
     over = {"camera": {"azimuth": Normal(30.0, 10.0), "elevation": lambda share: 20.0 + share}}
-    settings = settings_of(over)
-    assert only_here(over) == ["camera.elevation (drawn by <lambda>)"]
+    settings = controls_to_settings(over)
+    assert list_session_only_controls(over) == ["camera.elevation (drawn by <lambda>)"]
     config = AttackConfig(object="mug", controls={"pose": {}}, over=settings)
     assert config.over["camera"]["azimuth"] == NORM
     elevation = config.over["camera"]["elevation"]
     assert elevation == {"distribution": "from Python", "name": "<lambda>", "quantiles": [20.05, 20.5, 20.95]}
-    (control,) = as_controls(config.over)
+    (control,) = make_controls(config.over)
     bound = control.bind(MUG)
     assert isinstance(bound, NumberControl)
     assert float(bound.values(torch.tensor([0.5, 0.5]))["elevation"]) == pytest.approx(20.5, abs=1e-4)

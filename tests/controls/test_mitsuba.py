@@ -13,13 +13,13 @@ import advsearch
 from advsearch.cli.flags import config_from
 from advsearch.cli.main import _parse
 from advsearch.controls import make_space
-from advsearch.engine.gradients import smooth_loss
-from advsearch.engine.loading import as_controls
+from advsearch.engine.gradients import make_smooth_loss
+from advsearch.engine.loading import make_controls
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.sweep.axes import on_grid, read_axes
+from advsearch.questions.sweep.axes import add_grid_axes, parse_axes
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene, write_xml
 from advsearch.scene.mitsuba_backend.xml_files import read_scene
 
@@ -33,23 +33,23 @@ SIZE = 16
 def box(tmp_path_factory: pytest.TempPathFactory) -> advsearch.Scene:
     """Mitsuba's Cornell box as a file, with the large box as the object."""
     path = tmp_path_factory.mktemp("scenes") / "box.xml"
-    write_xml(path, mitsuba().cornell_box(), {}, "")
+    write_xml(path, import_mitsuba().cornell_box(), {}, "")
     return advsearch.load_scene(f"{path}#large-box")
 
 
 @pytest.mark.medium
 def test_the_picture_is_that_of_the_scene_with_the_value(box: advsearch.Scene, tmp_path: Path) -> None:
-    changed = mitsuba().cornell_box()
+    changed = import_mitsuba().cornell_box()
     changed["red"]["reflectance"]["value"] = [0.3] * 3
     changed["light"]["emitter"]["radiance"]["value"] = [5.0] * 3
     write_xml(tmp_path / "other.xml", changed, {}, "")
     other = advsearch.load_scene(f"{tmp_path}/other.xml#large-box").description
-    expected = MitsubaScene(other, (SIZE, SIZE)).radiance({}, 1, 36).numpy()
+    expected = MitsubaScene(other, (SIZE, SIZE)).render_radiance({}, 1, 36).numpy()
     controls = {f"mitsuba:{RED}": [0.2, 0.4], f"mitsuba:{GLOW}": [4, 6]}
     renderer = box.renderer(controls, resolution=SIZE, denoise="none")
     middle = torch.full_like(renderer.start, 0.5)
     inputs = renderer.scene.assembly(renderer.space.inputs(middle))
-    found = renderer.scene.radiance(inputs, 1, 36).numpy()
+    found = renderer.scene.render_radiance(inputs, 1, 36).numpy()
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
     write_scene(renderer.scene, inputs, tmp_path / "again.xml", "")
     out = read_scene(tmp_path / "again.xml")
@@ -58,10 +58,10 @@ def test_the_picture_is_that_of_the_scene_with_the_value(box: advsearch.Scene, t
         [[0.3] * 3, [5.0] * 3],
         rtol=1e-6,
     )
-    stock = np.array(mitsuba().render(mitsuba().load_file(str(tmp_path / "again.xml")), seed=2, spp=1024))
+    stock = np.array(import_mitsuba().render(import_mitsuba().load_file(str(tmp_path / "again.xml")), seed=2, spp=1024))
     read = advsearch.load_scene(f"{tmp_path}/again.xml#object").description
-    back = MitsubaScene(read, (SIZE, SIZE)).radiance({}, 3, 1024).numpy()
-    first, second = (renderer.scene.radiance(inputs, seed, 1024).numpy() for seed in (4, 5))
+    back = MitsubaScene(read, (SIZE, SIZE)).render_radiance({}, 3, 1024).numpy()
+    first, second = (renderer.scene.render_radiance(inputs, seed, 1024).numpy() for seed in (4, 5))
     noise = np.abs(first - second).mean()
     assert noise < 0.02 * found.mean()
     assert max(np.abs(stock - first).mean(), np.abs(back - first).mean()) < 1.2 * noise
@@ -75,7 +75,7 @@ def test_the_start_is_the_scene_as_it_is(box: advsearch.Scene) -> None:
 
 @pytest.mark.medium
 def test_adjoints_agree_with_differences(box: advsearch.Scene) -> None:
-    controls, loss = {f"mitsuba:{RED}": [0.1, 0.9], f"mitsuba:{GLOW}": [1, 30]}, smooth_loss((SIZE, SIZE))
+    controls, loss = {f"mitsuba:{RED}": [0.1, 0.9], f"mitsuba:{GLOW}": [1, 30]}, make_smooth_loss((SIZE, SIZE))
     found = []
     for estimator in ("adjoint", "differences"):
         renderer = box.renderer(controls, resolution=SIZE, denoise="none", estimators={"*": estimator})
@@ -100,7 +100,7 @@ def test_bundled_scenes_have_such_names_too() -> None:
     dark, light = (renderer.radiance(torch.full((3,), share), 1, 16) for share in (0.0, 1.0))
     assert light.mean() > 1.2 * dark.mean()
     both = {"mitsuba:object.bsdf.brdf_0.roughness.value": [0.1, 1.0], "material": {"roughness": [0.1, 1.0]}}
-    space = make_space(as_controls(both), scene.description)
+    space = make_space(make_controls(both), scene.description)
     with pytest.raises(InputError, match=r"two controls set object\.roughness"):
         space.inputs(space.start)
 
@@ -146,8 +146,8 @@ def test_one_channel_of_a_colour_varies_and_the_others_stay(box: advsearch.Scene
 
 
 def test_a_name_of_mitsuba_is_an_axis_of_a_grid(box: advsearch.Scene) -> None:
-    axes = read_axes({f"mitsuba:{RED}.red": "0:1:3", f"mitsuba:{WIDE}": [30, 50]}, ())
-    space = make_space(on_grid((), axes, box.description), box.description)
+    axes = parse_axes({f"mitsuba:{RED}.red": "0:1:3", f"mitsuba:{WIDE}": [30, 50]}, ())
+    space = make_space(add_grid_axes((), axes, box.description), box.description)
     inputs = space.inputs(torch.tensor([0.5, 0.9]))
     np.testing.assert_allclose(inputs[f"mitsuba.{RED}"], [0.5, 0.0430135, 0.0443706], rtol=1e-5)
     assert float(inputs[f"mitsuba.{WIDE}"]) == 50.0

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from advsearch.controls import CONTROLS, Space, gathered, make_control, make_space
+from advsearch.controls import CONTROLS, Space, make_control, make_space, merge_control_settings
 from advsearch.engine.loading import Controls, Scene
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.sweep.axes import read_axes
+from advsearch.questions.sweep.axes import parse_axes
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.assets import Material, Mesh
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.parts import MeshPart
 
 HEIGHT = 0.5
@@ -31,7 +31,7 @@ def scene() -> SceneDescription:
     place = np.eye(4)
     place[:3, 3] = 1.9, -1.2, HEIGHT
     color = np.full((4, 4, 3), 0.25, dtype=np.float32)
-    return describe("mug").with_part(MeshPart("post", mesh, color, Material(roughness=0.7), to_world=place))
+    return load_description("mug").with_part(MeshPart("post", mesh, color, Material(roughness=0.7), to_world=place))
 
 
 def places(scene: SceneDescription, space: Space | None = None) -> np.ndarray:
@@ -73,7 +73,7 @@ def test_a_setting_and_a_control_mean_the_same(scene: SceneDescription) -> None:
 
 def test_coordinates_have_the_names_of_their_mesh(scene: SceneDescription) -> None:
     settings: dict[str, dict[str, object]] = {"pose": {}, "pose:post.yaw": {}, "material:post": {"roughness": [0, 1]}}
-    space = make_space([make_control(name, given) for name, given in gathered(settings).items()], scene)
+    space = make_space([make_control(name, given) for name, given in merge_control_settings(settings).items()], scene)
     named = space.describe(space.start)
     assert {"pose.yaw", "pose:post.yaw", "material:post.roughness"} <= set(named)
     assert named["material:post.roughness"]["value"] == pytest.approx(0.7)
@@ -87,11 +87,11 @@ def test_every_such_control_reaches_its_mesh_alone(scene: SceneDescription) -> N
         space = make_space([make_control(f"{kind}:post")], scene)
         assert {name.partition(".")[0] for name in space.inputs(space.start)} == {"post"}, kind
         assert space.controls[0].name == f"{kind}:post"
-    mug = describe("mug")
+    mug = load_description("mug")
     twin = mug.with_part(MeshPart("twin", mug.object.mesh, mug.object.base_color))
     space = make_space([make_control("geometry:twin", {"modes": 4})], twin)
     assert set(space.inputs(space.start)) == {"twin.offsets"}
-    assert list(space.files(space.start)) == ["geometry@twin.obj"]  # a name that every file system takes
+    assert list(space.get_artifact_files(space.start)) == ["geometry@twin.obj"]  # a name that every file system takes
 
 
 def test_the_object_is_a_mesh_too() -> None:
@@ -106,7 +106,7 @@ def test_names_that_are_none_are_refused(scene: SceneDescription) -> None:
     with pytest.raises(UnknownNameError, match=r"unknown scene parameter 'pose:post.yaww'"):
         Scene(scene).with_settings({"pose:post.yaww": 3.0})
     with pytest.raises(UnknownNameError, match=r"unknown mesh around the object 'post'"):
-        describe("mug", given={"pose:post.yaw": 3.0})
+        load_description("mug", given={"pose:post.yaw": 3.0})
     for kind in ("patch", "light", "camera"):
         with pytest.raises(InputError, match=rf"`controls` {kind}:post: {kind} can't be given to another mesh"):
             make_space([make_control(f"{kind}:post")], scene)
@@ -115,7 +115,7 @@ def test_names_that_are_none_are_refused(scene: SceneDescription) -> None:
 
 
 def test_a_grid_over_the_pose_of_another_mesh(scene: SceneDescription) -> None:
-    (axis,) = read_axes({"pose:post.yaw": "0:360:4"}, [])
+    (axis,) = parse_axes({"pose:post.yaw": "0:360:4"}, [])
     assert (axis.name, axis.instance, axis.values) == ("pose:post.yaw", "pose:post", (0.0, 90.0, 180.0, 270.0))
 
 
@@ -143,4 +143,4 @@ def test_a_moved_mesh_is_seen_and_differentiated(scene: SceneDescription) -> Non
 def test_settings_make_the_same_controls_again() -> None:
     for kind in ("pose", "texture", "material", "geometry", "body"):
         control = make_control(f"{kind}:post")
-        assert make_control(control.name, control.settings()).name == f"{kind}:post"
+        assert make_control(control.name, control.to_settings()).name == f"{kind}:post"

@@ -17,17 +17,17 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 import advsearch
-from advsearch.api.export import printable
+from advsearch.api.export import make_printable_pieces
 from advsearch.cli.main import main
 from advsearch.controls import make_control, make_space
-from advsearch.engine.judging import off_print, variation
-from advsearch.engine.transport import remark
+from advsearch.engine.judging import mean_variation, printable_distance
+from advsearch.engine.transport import make_rendering_remark
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.predictor import Refusal, RefusalCause
-from advsearch.scene.raster import looked_up, texels_of_faces, texels_read
-from advsearch.scene.transport.lights import why_not
+from advsearch.scene.raster import find_exclusive_texels, find_read_texels, look_up_texture
+from advsearch.scene.transport.lights import find_refusal
 from advsearch.scene.transport.matrix import LinearRenderer
 
 Box = tuple[Sequence[float], Sequence[float]]
@@ -104,7 +104,7 @@ def seen(mesh: Mesh, faces: np.ndarray, texture: np.ndarray, count: int = 40) ->
     weights = np.random.default_rng(0).dirichlet([0.3] * 3, size=(len(faces), count))
     uvs = np.einsum("fnk,fkc->fnc", weights, mesh.uvs[mesh.faces[faces]].astype(np.float64)).reshape(-1, 2)
     height, width = texture.shape[:2]
-    return looked_up(texture, uvs[:, 0] * width - 0.5, (1.0 - uvs[:, 1]) * height - 0.5)
+    return look_up_texture(texture, uvs[:, 0] * width - 0.5, (1.0 - uvs[:, 1]) * height - 0.5)
 
 
 # ---- what is known of a file ----------------------------------------------------------------------------------------
@@ -124,7 +124,7 @@ def test_the_materials_of_a_file_keep_their_faces_and_their_texels(
         found = seen(mesh, faces, asset.base_color)
         wanted = COLOURS[name] if write is car else linear_to_display(COLOURS[name])
         np.testing.assert_allclose(found, np.broadcast_to(wanted, found.shape), atol=0.01)
-        assert texels_of_faces(mesh, faces, (side, side))[1] == 1.0, "no texel is read by two materials"
+        assert find_exclusive_texels(mesh, faces, (side, side))[1] == 1.0, "no texel is read by two materials"
     told = " ".join(asset.warnings)
     assert "the colours of its 5 materials were baked into one texture (512 x 512 texels)" in told
 
@@ -144,7 +144,7 @@ def test_materials_of_one_colour_are_told_apart_too(tmp_path: Path) -> None:
     (tmp_path / "two.obj").write_text("mtllib two.mtl\n" + "\n".join(lines) + "\n")
     (tmp_path / "two.mtl").write_text("newmtl left\nKd 0.2 0.4 0.6\nnewmtl right\nKd 0.2 0.4 0.6\n")
     mesh = import_object(tmp_path / "two.obj").mesh
-    assert [texels_of_faces(mesh, faces, (256, 256))[1] for faces in mesh.materials.values()] == [1.0, 1.0]
+    assert [find_exclusive_texels(mesh, faces, (256, 256))[1] for faces in mesh.materials.values()] == [1.0, 1.0]
 
 
 def two_quads(folder: Path, ending: str) -> Path:
@@ -211,7 +211,7 @@ def test_the_texels_that_lookups_read_are_all_there(seed: int) -> None:
     random, shape = np.random.default_rng(seed), (13, 17)
     triangle = random.random((1, 3, 2)) * [17, 13] * random.choice([0.1, 0.5, 1.0])
     triangle = (np.round(triangle) if seed % 2 else triangle) - 0.5
-    read = texels_read(triangle, shape)
+    read = find_read_texels(triangle, shape)
     places = random.dirichlet([0.5] * 3, 20_000) @ triangle[0]
     left, top = np.floor(places[:, 0]).astype(int), np.floor(places[:, 1]).astype(int)
     wanted = np.zeros(shape, bool)
@@ -244,13 +244,13 @@ def test_only_the_texels_of_the_materials_are_painted(scene: advsearch.Scene, fo
     control = make_control("texture", {"materials": ["Body Paint", "roof"], **form})
     space, asset = make_space([control], scene.description), scene.description.object
     u = torch.rand(space.start.shape, generator=torch.Generator().manual_seed(0))
-    made = space.artifacts(u)
+    made = space.get_artifact_images(u)
     before, after = made["texture-original"].numpy(), made["texture"].numpy()
     assert np.array_equal(before, asset.base_color)
     for name, faces in asset.mesh.materials.items():
         same = (seen(asset.mesh, faces, before) == seen(asset.mesh, faces, after)).all(axis=1)
         assert same.mean() < 0.05 if name in ("Body Paint", "roof") else same.all(), name
-    assert np.array_equal(space.artifacts(space.start)["texture"].numpy(), before)
+    assert np.array_equal(space.get_artifact_images(space.start)["texture"].numpy(), before)
 
 
 def test_the_ball_is_over_what_is_painted(scene: advsearch.Scene) -> None:
@@ -272,7 +272,7 @@ def test_a_material_can_stand_where_a_mesh_does(scene: advsearch.Scene, name: st
     other = make_space([make_control("texture", {"materials": wanted})], scene.description)
     assert torch.equal(space.start, other.start)
     assert set(space.inputs(space.start)) == {"object.base_color"}
-    assert set(space.artifacts(space.start)) == {name.replace(":", "@"), f"{name.replace(':', '@')}-original"}
+    assert set(space.get_artifact_images(space.start)) == {name.replace(":", "@"), f"{name.replace(':', '@')}-original"}
 
 
 @pytest.mark.parametrize(
@@ -316,7 +316,7 @@ def test_materials_beside_each_other_on_one_picture_share_no_texel(tmp_path: Pat
     described = advsearch.load_scene(tmp_path / "q.obj", up="z").description
     mesh, own = described.object.mesh, described.object.base_color
     space = make_space([make_control("texture", {"materials": "one"})], described)
-    after = space.artifacts(torch.rand(space.start.shape))["texture"].numpy()
+    after = space.get_artifact_images(torch.rand(space.start.shape))["texture"].numpy()
     assert own.shape == after.shape == (256, 320, 3)
     other = mesh.materials["other"]
     assert np.array_equal(seen(mesh, other, own, 4000), seen(mesh, other, after, 4000))
@@ -376,11 +376,11 @@ def test_a_search_over_the_paint_of_a_car_with_glass_renders_nothing(file: Path,
     assert found.renders["products"] == 16 and found.renders["gradient"] == 0
     before, after = (np.array(Image.open(run / "artifacts" / f"texture{one}.png")) for one in ("-original", ""))
     asset = import_object(file)
-    painted = texels_of_faces(asset.mesh, asset.mesh.materials["Body Paint"], (512, 512))[0]
+    painted = find_exclusive_texels(asset.mesh, asset.mesh.materials["Body Paint"], (512, 512))[0]
     changed = (before != after).any(axis=2)
     assert changed.any() and not changed[~painted].any()
     length, width, height = 100.0, 40.0, 15.0  # of the body's box, where the car is as long
-    sizes = sum(int(piece.size[0] * piece.size[1]) for piece in printable(run, length))
+    sizes = sum(int(piece.size[0] * piece.size[1]) for piece in make_printable_pieces(run, length))
     assert sizes == pytest.approx(2 * (length * width + length * height + width * height), rel=0.1)
 
 
@@ -392,9 +392,9 @@ def test_print_terms_count_what_is_painted() -> None:
     where = torch.zeros(4, 5, 1)
     where[:2, :3] = 1.0
     masked = torch.cat([colors, where], dim=-1)
-    assert float(off_print(masked)) == pytest.approx(float(off_print(colors[:2, :3]))) == 0.0
-    assert float(variation(masked)) == pytest.approx(2 * 0.4 / 6)
-    assert float(variation(torch.cat([colors, torch.ones(4, 5, 1)], dim=-1))) == float(variation(colors))
+    assert float(printable_distance(masked)) == pytest.approx(float(printable_distance(colors[:2, :3]))) == 0.0
+    assert float(mean_variation(masked)) == pytest.approx(2 * 0.4 / 6)
+    assert float(mean_variation(torch.cat([colors, torch.ones(4, 5, 1)], dim=-1))) == float(mean_variation(colors))
 
 
 HAZY = {"density": [0.0, 0.05]}
@@ -412,10 +412,14 @@ def test_what_could_be_done_so_that_steps_are_predicted(
     controls: dict[str, Any], options: dict[str, Any], told: str
 ) -> None:
     """Nothing where it would not be enough."""
-    reason = why_not(advsearch.load_scene("mug").renderer(controls, resolution=16, **options))
-    assert reason is not None and told in remark(reason) and bool(told) == bool(remark(reason))
+    reason = find_refusal(advsearch.load_scene("mug").renderer(controls, resolution=16, **options))
+    assert (
+        reason is not None
+        and told in make_rendering_remark(reason)
+        and bool(told) == bool(make_rendering_remark(reason))
+    )
     too_large = Refusal("the matrix would take more than 1 GiB", RefusalCause.TOO_LARGE)
-    assert remark(too_large).startswith("Each step of the search is rendered, which takes several times")
+    assert make_rendering_remark(too_large).startswith("Each step of the search is rendered, which takes several times")
 
 
 @pytest.mark.medium

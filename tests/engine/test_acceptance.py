@@ -11,7 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.engine.acceptance import BOUND, VIEWS, ComparedView, compared, squares_off, view_of
+from advsearch.engine.acceptance import (
+    MIN_ALLOWED_LEVELS,
+    N_VIEWS,
+    ComparedView,
+    compare_views,
+    compare_with_traced,
+    compute_squared_error,
+)
 
 SEARCHES = 400
 
@@ -21,9 +28,9 @@ def accepted(share: float, bias: float = 0.0, deviation: float = 0.2) -> float:
     squared errors are log-normal, and whose margins are off by a bias and a deviation."""
     random, sigma = np.random.default_rng(0), math.sqrt(math.log(1.0 + 0.8**2))
     good = 0
-    for normal in random.normal(size=(SEARCHES, 2, VIEWS)):
+    for normal in random.normal(size=(SEARCHES, 2, N_VIEWS)):
         squares, margins = share**2 * np.exp(sigma * normal[0] - sigma**2 / 2.0), bias + deviation * normal[1]
-        good += compared(lambda n, s=squares, m=margins: ComparedView(9.0 * s[n], 9.0, m[n], 3)).good  # type: ignore[misc]
+        good += compare_views(lambda n, s=squares, m=margins: ComparedView(9.0 * s[n], 9.0, m[n], 3)).is_accepted  # type: ignore[misc]
     return good / SEARCHES
 
 
@@ -47,18 +54,18 @@ def test_right_predictions_are_accepted_and_wrong_ones_seldom(
 
 def test_few_views_decide_where_they_are_clear() -> None:
     for square, margin, pictures in ((1.0, 0.0, 6), (90.0, 0.0, 6), (8.0, 0.0, 18), (1.0, 0.5, 18)):
-        assert compared(lambda number, s=square, m=margin: ComparedView(s, 9.0, m, 3)).pictures == pictures  # type: ignore[misc]
+        assert compare_views(lambda number, s=square, m=margin: ComparedView(s, 9.0, m, 3)).n_traced == pictures  # type: ignore[misc]
 
 
 def test_what_the_search_moved_allows_as_small_a_part_of_it() -> None:
-    assert compared(lambda number: ComparedView(1.0, 9.0, 1.0, 3, moved=30.0)).good
-    assert not compared(lambda number: ComparedView(1.0, 9.0, 1.0, 3, moved=10.0)).good
+    assert compare_views(lambda number: ComparedView(1.0, 9.0, 1.0, 3, margin_change=30.0)).is_accepted
+    assert not compare_views(lambda number: ComparedView(1.0, 9.0, 1.0, 3, margin_change=10.0)).is_accepted
 
 
 @pytest.mark.parametrize("broken", [{"margin": math.nan}, {"square": math.nan}, {"margin": math.inf}])
 def test_what_is_no_number_is_refused(broken: dict[str, float]) -> None:
     given: dict[str, Any] = {"square": 1.0, "allowed": 9.0, "margin": 0.0, "pictures": 3, **broken}
-    assert not compared(lambda number: ComparedView(**given)).good
+    assert not compare_views(lambda number: ComparedView(**given)).is_accepted
 
 
 class Tracer:
@@ -90,7 +97,9 @@ def seen(change: Callable[[Tracer, Tensor], Tensor], margin: Callable[[Tensor, T
     """The comparison of a picture that is changed."""
     tracer: Any = Tracer()
     predicted = change(tracer, tracer.picture.clone())
-    return compared(lambda number: view_of(tracer, predicted, torch.zeros(1), 10 * number, 8, margin)), predicted
+    return compare_views(
+        lambda number: compare_with_traced(tracer, predicted, torch.zeros(1), 10 * number, 8, margin)
+    ), predicted
 
 
 def brighter(tracer: Tracer, picture: Tensor) -> Tensor:
@@ -105,7 +114,7 @@ def test_a_small_object_that_is_too_bright_is_refused() -> None:
     assert whole < 3.0 and found.levels > 25.0 and not found.good
     assert "levels of 255 off on the object" in found.reason
     right, _ = seen(lambda tracer, picture: picture)
-    assert right.good and right.levels < BOUND
+    assert right.good and right.levels < MIN_ALLOWED_LEVELS
 
 
 def test_a_bias_of_the_margin_is_refused_where_the_picture_is_near_enough() -> None:
@@ -113,11 +122,13 @@ def test_a_bias_of_the_margin_is_refused_where_the_picture_is_near_enough() -> N
         return 100.0 * float(picture[..., 0].mean())
 
     found, _ = seen(lambda tracer, picture: picture + 0.005, model)
-    assert found.levels < BOUND and found.logits == pytest.approx(0.5, abs=1e-3) and not found.good
+    assert found.levels < MIN_ALLOWED_LEVELS and found.logits == pytest.approx(0.5, abs=1e-3) and not found.good
     assert found.reason == "+0.50 off in the margin, where 0.30 would do"
 
 
 def test_the_noise_of_traced_pictures_does_not_count() -> None:
     tracer = Tracer(noise=0.05)
-    off = [squares_off(tracer.picture + 0.02, (tracer.noisy(2 * n), tracer.noisy(2 * n + 1))) for n in range(8)]
+    off = [
+        compute_squared_error(tracer.picture + 0.02, (tracer.noisy(2 * n), tracer.noisy(2 * n + 1))) for n in range(8)
+    ]
     assert np.mean(off) == pytest.approx((255 * 0.02) ** 2, rel=0.1)

@@ -17,7 +17,7 @@ from advsearch.engine.bank import Bank
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import PredictedSearch, Transport
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.attack.carry_out import problem_of
+from advsearch.questions.attack.carry_out import make_problem_on
 from advsearch.questions.attack.settings import AttackConfig
 
 SMALL: dict[str, Any] = {
@@ -45,7 +45,7 @@ def scene() -> advsearch.Scene:
 
 def problem(scene: advsearch.Scene, objective: Callable[..., Tensor], **settings: Any) -> Problem:
     config = AttackConfig(object="mug", resolution="16", spp=2, denoise="none", **settings)
-    made = problem_of(config, scene, sure())
+    made = make_problem_on(config, scene, sure())
     made.objective = get_objective(objective, made.task)
     return made
 
@@ -74,12 +74,12 @@ def test_a_search_follows_a_loss_of_the_texture(scene: advsearch.Scene) -> None:
 def test_it_is_the_same_for_rendered_and_for_predicted_pictures(
     over: dict[str, Any], scene: advsearch.Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bank, "FIRST", 2)
+    monkeypatch.setattr(bank, "INITIAL_CONDITIONS", 2)
     settings = {"over": over, "draws": 2} if over else {}
     made = problem(scene, pinker, controls=TEXTURE, **settings)
     predicted: PredictedSearch = Bank(made, 16, partial(map, made.evaluate)) if over else Transport(made, 16)
     at = made.domain.begin.clone().requires_grad_()
-    value = pinker(at, at, at, made.searched_space.printed(at)["texture"][None])
+    value = pinker(at, at, at, made.searched_space.get_printable_colors(at)["texture"][None])
     value.sum().backward()
     for one in (made, predicted):
         found = one.evaluate(Query(at.detach(), 0, phase="search", gradient=True))
@@ -106,21 +106,25 @@ def test_the_derivative_is_that_of_the_picture_and_that_of_what_was_asked_for(sc
     assert found.gradient is not None and picture.gradient is not None
     at = u.clone().requires_grad_()
     space = made.searched_space
-    yaw = space.numbers(at)["pose.yaw"]
-    own = at.square().sum() + 3.0 * space.printed(at)["texture"].mean() + space.inputs(at)["object.base_color"].sum()
+    yaw = space.get_numeric_values(at)["pose.yaw"]
+    own = (
+        at.square().sum()
+        + 3.0 * space.get_printable_colors(at)["texture"].mean()
+        + space.inputs(at)["object.base_color"].sum()
+    )
     value = picture.objective * (1.0 + 0.1 * yaw) + own
     value.backward()
     assert at.grad is not None
     expected = at.grad + (1.0 + 0.1 * float(yaw.detach())) * picture.gradient
     assert found.objective == pytest.approx(float(value.detach()), rel=1e-5)
     assert torch.allclose(found.gradient, expected, rtol=1e-3, atol=1e-5)
-    assert made.plan.having("secant") and made.plan.having("adjoint"), "both ways"
+    assert made.plan.groups_with("secant") and made.plan.groups_with("adjoint"), "both ways"
 
 
 def test_what_is_asked_for_is_of_every_picture(scene: advsearch.Scene) -> None:
     made = problem(scene, pinker, controls=TEXTURE, over={"camera": {}})
-    wholes = [made.whole(made.domain.start, draw) for draw in range(3)]
-    asked = made.asked(*wholes)
+    wholes = [made.add_conditions(made.domain.start, draw) for draw in range(3)]
+    asked = made.make_objective_inputs(*wholes)
     assert asked("u").shape == (3, len(made.domain.start)) and asked("texture").shape == (3, 8, 8, 3)
     azimuths = asked("configuration")["camera.azimuth"]
     said = [made.space.describe(whole)["camera.azimuth"]["value"] for whole in wholes]
@@ -137,7 +141,7 @@ def test_a_texture_that_is_not_there_is_refused_before_anything_is_rendered(scen
     with pytest.raises(InputError, match=r"asks for `texture`, .* got camera; add `texture` or `patch`"):
         advsearch.attack(scene, sure(), controls="camera", objective=pinker, **SMALL)
     made = problem(scene, pinker, controls={**TEXTURE, "patch": {}})
-    asked = made.asked(made.domain.start)
+    asked = made.make_objective_inputs(made.domain.start)
     with pytest.raises(InputError, match="got texture, patch; ask for `textures`"):
         asked("texture")
     textures = asked("textures")

@@ -7,12 +7,12 @@ import pytest
 from scipy.stats import chi2_contingency
 
 from advsearch.questions.sweep.surface import (
-    SHARINGS,
+    N_PERMUTATIONS,
     PartCounts,
     _likelihood_ratio,
     _newcombe,
-    association,
-    exchange,
+    compare_parts,
+    permute_draws,
 )
 
 
@@ -36,9 +36,9 @@ def test_wrong_predictions_are_shared_out_to_the_last() -> None:
     counts = PartCounts(2, 9, 4, seed=1)
     for number in range(9):
         counts.add(np.array([0] if number % 3 else [0, 1]), number < 4)
-    assert counts.seen.tolist() == [9, 3] and counts.wrong.tolist() == [4, 2]
-    assert (counts.chance[:, 0] == 4).all() and len(counts.chance) == SHARINGS
-    assert counts.chance[:, 1].mean() == pytest.approx(4 * 3 / 9, abs=0.2)
+    assert counts.visible_counts.tolist() == [9, 3] and counts.wrong_counts.tolist() == [4, 2]
+    assert (counts.permuted_counts[:, 0] == 4).all() and len(counts.permuted_counts) == N_PERMUTATIONS
+    assert counts.permuted_counts[:, 1].mean() == pytest.approx(4 * 3 / 9, abs=0.2)
 
 
 @pytest.mark.medium
@@ -50,7 +50,7 @@ def test_nothing_is_told_where_nothing_is_but_what_is_there() -> None:
         angle, width = random.random(40), 0.4
         for picture, failed in zip(angle, wrong, strict=True):  # neighbours are seen together
             counts.add(np.flatnonzero((np.arange(60) / 60 - picture) % 1.0 < width), bool(failed))
-        told += bool(association(counts, slice(0, 60), 5).significant.any())
+        told += bool(compare_parts(counts, slice(0, 60), 5).significant.any())
     assert told <= 8  # 3 on average; 9 or more once in 200
 
 
@@ -58,17 +58,17 @@ def test_a_part_that_decides_is_told_and_one_that_is_always_there_is_not_compare
     counts = PartCounts(3, 24, 12, seed=0)
     for number in range(24):
         counts.add(np.array([0, *([1] if number < 12 else [])]), number < 12)
-    found = association(counts, slice(0, 3), 5)
+    found = compare_parts(counts, slice(0, 3), 5)
     assert found.compared.tolist() == [False, True, False] and found.significant.tolist() == [False, True, False]
     assert found.difference[1] == 1.0 and found.low[1] == found.strength[1] > 0.6 and np.isnan(found.p[0])
-    assert association(counts, slice(1, 2), 5).p.tolist() == [1 / (1 + SHARINGS)]
+    assert compare_parts(counts, slice(1, 2), 5).p.tolist() == [1 / (1 + N_PERMUTATIONS)]
 
 
 def test_predictions_of_a_drive_are_exchanged_whole() -> None:
     wrong, draws = np.array([1, 1, 0, 0, 1, 0], np.int8), np.array([0, 1, 2, 0, 1, 2])
-    packed = exchange(wrong, draws, seed=0)
-    assert packed is not None and exchange(wrong, np.arange(6), seed=0) is None
-    shared = np.unpackbits(packed, axis=0, count=SHARINGS)
+    packed = permute_draws(wrong, draws, seed=0)
+    assert packed is not None and permute_draws(wrong, np.arange(6), seed=0) is None
+    shared = np.unpackbits(packed, axis=0, count=N_PERMUTATIONS)
     order = np.argsort(draws, kind="stable").reshape(3, 2)
     drives = {tuple(one) for one in wrong[order].tolist()}
     assert all({tuple(one) for one in dealt[order].tolist()} == drives for dealt in shared), "whole drives, each once"
@@ -83,11 +83,11 @@ def test_parts_that_some_drives_show_are_told_from_chance_by_drive() -> None:
         random = np.random.default_rng(trial)
         draws, wrong = np.repeat(np.arange(6), 10), np.repeat(random.random(6) < 0.5, 10)
         shows = np.repeat(random.random((6, 8)) < 0.5, 10, axis=0)
-        exchanged = exchange(wrong.astype(np.int8), draws, seed=trial)
-        counts = PartCounts(8, 60, int(wrong.sum()), seed=trial, exchanged=exchanged)
+        exchanged = permute_draws(wrong.astype(np.int8), draws, seed=trial)
+        counts = PartCounts(8, 60, int(wrong.sum()), seed=trial, permuted_failures=exchanged)
         for seen, failed in zip(shows, wrong, strict=True):
             counts.add(np.flatnonzero(seen), bool(failed))
-        found = association(counts, slice(0, 8), 5)
+        found = compare_parts(counts, slice(0, 8), 5)
         told += bool(found.significant.any())
         assert np.isnan(found.low).all() and (found.strength[found.compared] >= 0.0).all()
     assert told <= 6

@@ -12,8 +12,8 @@ import torch
 import advsearch
 from advsearch.attacks.domain import Block, Domain
 from advsearch.engine import acceptance, bank
-from advsearch.engine.bank import Bank, stratified
-from advsearch.engine.problem import hard_first
+from advsearch.engine.bank import Bank, sample_condition
+from advsearch.engine.problem import compute_condition_weights
 from advsearch.errors import ClusterError
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.run import attack_once
@@ -39,15 +39,15 @@ def test_conditions_are_stratified_and_numbered() -> None:
     """Sixteen of them: of each number, one in each sixteenth of its range; the same in any order. A choice has its
     middle, and a ball of a norm is drawn from."""
     box = Domain(torch.full((3,), 0.5), (Block(2, low=0.2, high=0.6), Block(1)))
-    drawn = torch.stack([stratified(box, number, seed=3) for number in range(16)])
+    drawn = torch.stack([sample_condition(box, number, seed=3) for number in range(16)])
     shares = (drawn - box.lower) / (box.upper - box.lower)
     assert all(sorted((shares[:, one] * 16).floor().tolist()) == list(range(16)) for one in range(3))
-    assert torch.equal(stratified(box, 7, seed=3), drawn[7])
-    assert not torch.equal(stratified(box, 7, seed=4), drawn[7])
+    assert torch.equal(sample_condition(box, 7, seed=3), drawn[7])
+    assert not torch.equal(sample_condition(box, 7, seed=4), drawn[7])
     choice = Domain(torch.tensor([0.25]), (Block(1, options=2),))
-    assert {float(stratified(choice, number, seed=0)) for number in range(8)} == {0.25, 0.75}
+    assert {float(sample_condition(choice, number, seed=0)) for number in range(8)} == {0.25, 0.75}
     ball = Domain(torch.full((4,), 0.5), (Block(4, norm="l2", epsilon=0.1),))
-    assert ball.contains(stratified(ball, 5, seed=0)) and stratified(ball, 5, seed=0).ne(0.5).any()
+    assert ball.contains(sample_condition(ball, 5, seed=0)) and sample_condition(ball, 5, seed=0).ne(0.5).any()
 
 
 def grow(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,13 +55,13 @@ def grow(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"EVERY": 6, "UNSEEN": 2, "SURE": -1e9, "FIRST": 3, "GROWTH": 4}.items():
         monkeypatch.setattr(bank, name, value)
     monkeypatch.setattr(acceptance, "CHECK_SPP", 4)
-    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: Refusal("matrices are tested"))
+    monkeypatch.setattr(surface_renderer, "find_refusal", lambda renderer, varying: Refusal("matrices are tested"))
 
 
 @pytest.fixture(autouse=True)
 def by_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let nothing be predicted by light on surfaces."""
-    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: Refusal("matrices are tested"))
+    monkeypatch.setattr(surface_renderer, "find_refusal", lambda renderer, varying: Refusal("matrices are tested"))
 
 
 @pytest.fixture
@@ -144,12 +144,12 @@ def test_a_run_that_was_killed_between_a_comparison_and_its_evaluation_goes_on(
 @pytest.mark.usefixtures("growing")
 def test_the_oldest_conditions_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where there is memory for two or three, the newest are kept and nothing fails."""
-    monkeypatch.setattr(bank, "MOST_BYTES", 150_000)
+    monkeypatch.setattr(bank, "MAX_BYTES", 150_000)
     kept: list[list[int]] = []
     drawn = Bank._choose_conditions
 
     def watched(self: Bank, kind: str, index: int) -> Any:
-        kept.append([one.number for one in self._conditions])
+        kept.append([one.index for one in self._conditions])
         return drawn(self, kind, index)
 
     monkeypatch.setattr(Bank, "_choose_conditions", watched)
@@ -164,7 +164,7 @@ def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch)
     """Under each condition, but for noise and what a matrix leaves out; and the derivative is the weighted mean."""
     seen: list[Bank] = []
     monkeypatch.setattr(Bank, "prepare", lambda self, tick: seen.append(self))
-    monkeypatch.setattr(bank, "FIRST", 2)
+    monkeypatch.setattr(bank, "INITIAL_CONDITIONS", 2)
     monkeypatch.setattr(bank, "SPP", 64)
     advsearch.attack("mug", **{**SMALL, "steps": 16, "epsilon": 0.3})
     made, problem = seen[0], seen[0].problem
@@ -174,12 +174,12 @@ def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch)
     with torch.no_grad():
         before, after = (made._predict_images(made._conditions, at) for at in (problem.domain.start, u))
         for one, change in zip(made._conditions, after - before, strict=True):
-            wholes = (torch.cat([at, one.numbers]) for at in (problem.domain.start, u))
+            wholes = (torch.cat([at, one.u]) for at in (problem.domain.start, u))
             first, second = (problem.renderer(whole, seed=1, spp=64) for whole in wholes)
             assert float((change - second + first).square().mean()) < 0.1 * float((second - first).square().mean())
     each = [made._evaluate_under([one], u, True) for one in made._conditions]
     values, gradients = torch.tensor([one.objective for one in each]), [one.gradient for one in each]
-    weights = hard_first(values)
+    weights = compute_condition_weights(values)
     assert float(weights.mean()) == pytest.approx(1.0) and int(weights.argmax()) == int(values.argmin())
     mean = sum(weight * one for weight, one in zip(weights, gradients, strict=True) if one is not None) / len(each)
     torch.testing.assert_close(made._evaluate_under(made._conditions, u, True).gradient, mean, rtol=1e-3, atol=1e-7)
@@ -187,14 +187,14 @@ def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch)
 
 def test_conditions_that_are_all_alike_count_the_same() -> None:
     for values in (torch.tensor([2.0, 2.0]), torch.tensor([3.0]), torch.tensor([math.inf, 1.0])):
-        assert hard_first(values).tolist() == [1.0] * len(values)
+        assert compute_condition_weights(values).tolist() == [1.0] * len(values)
 
 
 @pytest.mark.medium
 @pytest.mark.usefixtures("growing")
 def test_a_bank_that_teaches_enough_stops_growing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where unseen conditions are no better for the model, there are no more after the first comparison."""
-    monkeypatch.setattr(bank, "SURE", 1e9)
+    monkeypatch.setattr(bank, "MIN_STANDARD_ERRORS", 1e9)
     for limit in ("MARGIN", "BOUND"):  # predictions are good enough
         monkeypatch.setattr(acceptance, limit, 1e9)
     told = advsearch.attack("mug", **SMALL).summary.transport

@@ -19,7 +19,7 @@ from advsearch.engine.loading import make_renderer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.models import ModelWarning
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.scene.description import describe
+from advsearch.scene.description import load_description
 
 transformers = pytest.importorskip("transformers")
 
@@ -113,7 +113,7 @@ def test_each_picture_of_a_clip_is_that_of_its_time(tmp_path: Path) -> None:
     scene = advsearch.load_scene("mug", camera=clip(tmp_path)).description
     path = PathControl(path="orbit", seconds=2.0, time=[0.0, 1.0])
     whole = make_renderer(scene, compose([path], scene), SIDE, "none", 0)
-    alone = describe("mug")
+    alone = load_description("mug")
     still = make_renderer(alone, compose([path], alone), SIDE, "none", 0)
     u = torch.tensor([0.4])
     with torch.no_grad():
@@ -122,7 +122,7 @@ def test_each_picture_of_a_clip_is_that_of_its_time(tmp_path: Path) -> None:
             seed = 3 if number == 0 else seeds.stream(3, "camera", number)
             torch.testing.assert_close(picture, still(u + 0.1 * number, seed, 4), atol=2e-3, rtol=0.0)
             mask = still.mask(u + 0.1 * number)
-            assert torch.equal(whole.surfaces(u, camera=number).seen("object"), mask)
+            assert torch.equal(whole.surfaces(u, camera=number).visible_mask("object"), mask)
     assert float((pictures[3] - pictures[0]).abs().mean()) > 0.02
 
 

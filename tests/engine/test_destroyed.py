@@ -18,8 +18,8 @@ from advsearch.attacks import Block, Domain, Evaluation, Policy, Proposal, get_o
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, ObjectiveKind
 from advsearch.controls import CONTROLS, NumberControl, Parameter, compose
 from advsearch.copies import copied
-from advsearch.engine.judging import judgements
-from advsearch.engine.loading import as_controls, load_scene
+from advsearch.engine.judging import judge_images
+from advsearch.engine.loading import load_scene, make_controls
 from advsearch.errors import InputError
 from advsearch.models import Model, Preprocessing
 from advsearch.tasks import Classification, Facts, Prediction, Sight, Task, make_task
@@ -135,7 +135,7 @@ def test_a_metric_that_destroys_what_it_gets_changes_no_other() -> None:
         return {"output": output.sum(), "image": image.sum(), "truth": truth}
 
     output, pictures = LOGITS.clone(), PICTURES.clone()
-    said = judgements(TASK, output, pictures, [(1,)], {"first": first, "second": second})
+    said = judge_images(TASK, output, pictures, [(1,)], {"first": first, "second": second})
     assert [one.metrics for one in said] == [
         {"first": 0.0, "second.output": float(row.sum()), "second.image": float(picture.sum()), "second.truth": 1.0}
         for row, picture in zip(LOGITS, PICTURES, strict=True)
@@ -157,7 +157,9 @@ def test_a_task_from_a_function_and_the_facts_that_it_gets() -> None:
 
     mask = torch.ones(2, 2, dtype=torch.bool)
     facts = Facts(
-        "mug", describe=lambda: {"pose.yaw": 1.0}, look=lambda: Sight(mask, torch.ones(2, 2), torch.ones(2, 2))
+        "mug",
+        describe_values=lambda: {"pose.yaw": 1.0},
+        compute_sight=lambda: Sight(mask, torch.ones(2, 2), torch.ones(2, 2)),
     )
     task, output = make_task(judge), LOGITS.clone()
     assert [one.margin for one in task.judge(output, facts)] == [1.0, 3.5]
@@ -237,11 +239,11 @@ class DimControl(NumberControl):
 
 
 def test_a_control_that_destroys_what_it_is_handed() -> None:
-    space = compose([*as_controls(["texture"]), DimControl(amount=[0, 1])], MUG)
+    space = compose([*make_controls(["texture"]), DimControl(amount=[0, 1])], MUG)
     u = space.start.clone()
     image = torch.rand(4, 4, 3)
     kept_u, kept, before = u.clone(), image.clone(), space.inputs(u)["object.base_color"].clone()
-    assert torch.allclose(space.picture(u, image), kept * 0.8)
+    assert torch.allclose(space.apply_to_image(u, image), kept * 0.8)
     space.describe(u)
     assert torch.equal(space.inputs(u)["object.base_color"], before)
     assert torch.equal(u, kept_u) and torch.equal(image, kept)
@@ -253,7 +255,7 @@ def test_a_control_that_destroys_what_it_is_handed() -> None:
 def test_what_a_space_hands_out_may_be_destroyed(kind: str) -> None:
     """A loop of one's own gets tensors that nothing else reads."""
     scenes: dict[str, Any] = {"body": {"object": "person"}, "things": {"object": "mug", "things": "bottle@0.4,0.1"}}
-    space = compose(as_controls([kind]), load_scene(**scenes[kind]).description if kind in scenes else MUG)
+    space = compose(make_controls([kind]), load_scene(**scenes[kind]).description if kind in scenes else MUG)
     u = space.start.clone()
     first = {ask: copied(getattr(space, ask)(u)) for ask in ("inputs", "printed", "numbers")}
     for ask in first:

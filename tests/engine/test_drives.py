@@ -16,22 +16,22 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.cli.output import shown_text as text_of
-from advsearch.engine.journal import worker_call
+from advsearch.engine.journal import make_worker_call
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.explain.rows import read_predictions
 from advsearch.questions.sweep import job as swept_scene
-from advsearch.questions.sweep.carry_out import job_of
-from advsearch.questions.sweep.display import claims, rate_text
-from advsearch.questions.sweep.drives import Drives, longest, over_drives, planned_distances
-from advsearch.questions.sweep.job import OpenScenes
+from advsearch.questions.sweep.carry_out import load_job
+from advsearch.questions.sweep.display import make_sweep_claims, rate_text
+from advsearch.questions.sweep.drives import Drives, compute_distance_bounds, find_longest_run, summarize_drives
+from advsearch.questions.sweep.job import SceneLoader
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.stored import StoredSweep
 from advsearch.questions.sweep.summary import DriveRates
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.tables import read_sweep
-from advsearch.statistics.clustered import share_interval
+from advsearch.statistics.clustered import rate_interval
 from advsearch.statistics.intervals import clopper_pearson
 
 SMALL: dict[str, Any] = {"resolution": 16, "spp": 1, "trials": 0, "batch": 4}
@@ -107,10 +107,10 @@ def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_sam
         object="mug", size=1.0, controls={"path": {"seconds": 4.0, "reach": 4.0}}, path="approach+approach", fps=1.0,
         set_={"camera.elevation": 0.0, "camera.distance": 2.0}, resolution=16, spp=1, trials=0, batch=2,
     )  # fmt: skip
-    job = job_of(config)
-    executor = Disorder(worker_call(OpenScenes(job).named), seed=1) if workers else None
+    job = load_job(config)
+    executor = Disorder(make_worker_call(SceneLoader(job).load_by_name), seed=1) if workers else None
     with RunDirectory.create(tmp_path / "run") as run:
-        Sweep(job, run, NullProgress(), executor).carry_out()
+        Sweep(job, run, NullProgress(), executor).execute()
         away = {row.values["path.time"]["value"]: row.values["path.distance"]["value"] for row in run.store.rows()}
     assert away == pytest.approx({0.0: 14.0, 1.0: 11.0, 2.0: 8.0, 3.0: 5.0, 4.0: 2.0}, abs=1e-4)
 
@@ -134,7 +134,7 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
         90,
     ]
     shares = ([5, 2, 4, 4], [5] * 4)
-    assert result.summary.interval == pytest.approx(share_interval(*shares)), "over drives, not over 20 frames"
+    assert result.summary.interval == pytest.approx(rate_interval(*shares)), "over drives, not over 20 frames"
     assert result.summary.units == 4 and rate_text(result.summary).endswith(", over drives")
     times = [row for row in result.summary.axes if row.axis == "path.time"]
     assert times[0].interval == clopper_pearson(times[0].correct, 4), "at one time each drive has one frame"
@@ -142,7 +142,7 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
     assert yaw.interval is None and yaw.accuracy == 1.0, "one drive of five frames"
     assert "4 drives can show little" in " ".join(result.summary.warnings)
     assert len(set(read_sweep(path)["unit"])) == 4
-    (claim, *_) = claims(result.summary)
+    (claim, *_) = make_sweep_claims(result.summary)
     assert "frames of 4 drives" in claim.statement and "sampler" not in claim.statement
     text = text_of(result.summary)
     assert "4 drives of 5 frames in 4 s, clock" in text and "75 %" in text and "40 %" in text and "drive.webp" in text
@@ -160,7 +160,7 @@ def test_two_models_are_compared_and_explained_by_drive(tmp_path: Path, monkeypa
     path, drive = tmp_path / "run", {**DRIVE, "grid": {"pose.yaw": "0:330:12"}}
     table = advsearch.sweep("mug", models, run=path, **SMALL, **drive)
     assert table.summary.configurations == 120 and [one.drives for one in table.summary.drives or ()] == [12, 12]
-    assert table.summary.interval == pytest.approx(share_interval([5] * 12, [10] * 12)), "both saw the same drives"
+    assert table.summary.interval == pytest.approx(rate_interval([5] * 12, [10] * 12)), "both saw the same drives"
     (pair,) = advsearch.compare(path, pictures=0, run=tmp_path / "compared").pairs
     assert pair.units == 12 and (pair.first_only, pair.second_only) == (12, 0)
     assert pair.p > 0.05 and pair.interval[0] < 0.0, "12 pairs of 60, one of each drive, are no proof"
@@ -198,13 +198,13 @@ CONFIG = SweepConfig(
 @pytest.mark.medium
 def test_resumed_and_shared_drives_are_those_of_one_who_did_it_alone(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "alone") as run:
-        alone = Sweep(job_of(CONFIG), run, NullProgress()).carry_out()
+        alone = Sweep(load_job(CONFIG), run, NullProgress()).execute()
     path = tmp_path / "shared"
     for resumed in (False, True):
-        job = job_of(CONFIG)
+        job = load_job(CONFIG)
         with RunDirectory.resume(path) if resumed else RunDirectory.create(path) as run:
-            executor = Disorder(worker_call(OpenScenes(job).named), seed=3, stop=None if resumed else 4)
-            found = Sweep(job, run, NullProgress(), executor).carry_out()
+            executor = Disorder(make_worker_call(SceneLoader(job).load_by_name), seed=3, stop=None if resumed else 4)
+            found = Sweep(job, run, NullProgress(), executor).execute()
     assert rows(path) == rows(tmp_path / "alone") and len(rows(path)) == 2 * 3 * 3 * 2
     assert summary(found) == summary(alone) and alone.summary.drives is not None
     assert alone.summary.drives[0].drives == 12 and alone.summary.drives[0].right.interval is not None
@@ -213,14 +213,14 @@ def test_resumed_and_shared_drives_are_those_of_one_who_did_it_alone(tmp_path: P
 
 
 def test_an_interval_is_that_of_a_mean_between_its_ends_and_has_a_width() -> None:
-    assert over_drives(np.array([0.75]), worst=min).interval is None, "one drive says nothing of others"
+    assert summarize_drives(np.array([0.75]), worst=min).interval is None, "one drive says nothing of others"
     values = np.random.default_rng(0).uniform(2.0, 5.0, 400)
-    many = over_drives(values, max, (0.0, 8.0))
+    many = summarize_drives(values, max, (0.0, 8.0))
     assert many.interval is not None and many.worst == values.max()
     normal = 1.96 * values.std() / 20.0
     low, high = many.interval
     assert low < values.mean() - normal and values.mean() + normal < high and high - low < 4.0 * 2.0 * normal
-    same = over_drives(np.full(9, 0.5), worst=min).interval
+    same = summarize_drives(np.full(9, 0.5), worst=min).interval
     assert same is not None and same[0] < 0.4 and same[1] > 0.6, "nine drives that are alike are nine drives"
 
 
@@ -234,7 +234,7 @@ def test_intervals_over_drives_cover_the_mean_of_few_drives(drives: int, kind: s
         "right all the way or seldom": (np.where(q < 0.9, 1.0, part / 2), 0.925),
         "all or none": ((q < 0.95) * 1.0, 0.95),
     }[kind]
-    got = [over_drives(one, worst=min).interval for one in values]
+    got = [summarize_drives(one, worst=min).interval for one in values]
     assert sum(one is not None and one[0] <= truth <= one[1] for one in got) >= 112  # under 95 % by chance: 1 in 40
 
 
@@ -246,18 +246,18 @@ def test_the_mean_distance_at_first_sight_takes_its_range_from_the_plan_or_has_n
         object="mug", size=1.0, controls={"path": {"reach": 4.0}}, path=f"approach,{far}", samples=2, fps=1.0,
         set_={"camera.elevation": 0.0, "camera.distance": 1.0}, resolution=16, spp=1, trials=0,
     )  # fmt: skip
-    job = job_of(config)
+    job = load_job(config)
     (axis,) = (one for one in job.axes if one.is_time)
-    ends = planned_distances(job, axis)
+    ends = compute_distance_bounds(job, axis)
     assert ends == pytest.approx((1.0, 60.0), abs=1e-3)
     rng, covered, runs = np.random.default_rng(0), 0, 200
     for _ in range(runs):
         first = rng.choice([4.0, 60.0], 5, p=[0.9, 0.1])
-        interval = over_drives(first, min, ends).interval
+        interval = summarize_drives(first, min, ends).interval
         assert interval is not None
         covered += interval[0] <= 9.6 <= interval[1]
     assert covered >= 0.94 * runs
-    assert over_drives(np.array([4.0, 5.0, 6.0]), min, None).interval is None, "of no known range there is none"
+    assert summarize_drives(np.array([4.0, 5.0, 6.0]), min, None).interval is None, "of no known range there is none"
     assert Drives._distance_bounds is None, "never from the sample"
 
 
@@ -292,7 +292,7 @@ def test_repeats_of_points_of_a_grid_that_differ_in_noise_are_as_many_points(
     (said,), result = clocked("11111" + "00011" + "10111" + "11110", **REPEATED, grid={"pose.yaw": "0:360:4"})
     assert (said.drives, said.repeats, result.summary.units) == (4, 6, 4)
     assert said.right.mean == pytest.approx(0.75) and said.right.interval == pytest.approx(
-        share_interval([5, 2, 4, 4], [5] * 4)
+        rate_interval([5, 2, 4, 4], [5] * 4)
     )
     assert result.summary.interval == pytest.approx(said.right.interval)
     assert "Intervals are over 4 drives" in " ".join(result.summary.warnings)
@@ -330,7 +330,13 @@ def test_samples_without_draws_and_grids_that_overlap_are_units_by_their_values(
 
 
 def test_the_longest_run() -> None:
-    assert [longest(np.array(one, bool)) for one in ([], [0], [1], [1, 1, 0, 1], [0, 1, 0, 1, 1])] == [0, 0, 1, 2, 2]
+    assert [find_longest_run(np.array(one, bool)) for one in ([], [0], [1], [1, 1, 0, 1], [0, 1, 0, 1, 1])] == [
+        0,
+        0,
+        1,
+        2,
+        2,
+    ]
 
 
 def test_no_frames_no_drives_and_settings_that_need_a_path() -> None:

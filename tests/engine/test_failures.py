@@ -11,16 +11,16 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult
-from advsearch.attacks.candidates import Failures, FailureShare, FoundFailure
+from advsearch.attacks.candidates import FailureRate, Failures, FoundFailure
 from advsearch.attacks.verification import OVER_CONDITIONS, TRIAL_LOOKS, Rule
 from advsearch.cli.output import shown_text as text_of
-from advsearch.engine.journal import Journal, Shared
-from advsearch.engine.record import Findings
+from advsearch.engine.journal import Journal, ParallelEvaluator
+from advsearch.engine.record import RunState
 from advsearch.engine.verifier import Verifier
 from advsearch.progress import NullProgress, Stages
-from advsearch.questions.attack.display import failures_part, failures_text
-from advsearch.questions.attack.outcome import described_failures
-from advsearch.questions.attack.stages import MAX_TRIED_FAILURES, check_failures
+from advsearch.questions.attack.display import failures_text, make_failures_part
+from advsearch.questions.attack.outcome import describe_failures
+from advsearch.questions.attack.stages import MAX_TRIED_FAILURES, verify_failures
 from advsearch.questions.attack.summary import DifferentFailures
 from samples import attack, make_run, written_page
 from stand_ins import StandInProblem
@@ -49,14 +49,14 @@ def checked(known: Failures, *, rule: Rule | None = None, trials: int = 20) -> V
     """An attack of which everything but the different failures has been checked."""
     problem: Any = Coin(domain=NAMED)
     problem.rule = rule or problem.rule
-    verifier = Verifier(Journal(None, Shared(problem)), (8,), Stages(NullProgress()), looks=TRIAL_LOOKS)
+    verifier = Verifier(Journal(None, ParallelEvaluator(problem)), (8,), Stages(NullProgress()), looks=TRIAL_LOOKS)
     nothing = (0.0, 0.0, 0.0, Ending.FOUND, Ending.FOUND, (), (), 1, 0, 0, 0, 0.0)
     found = SearchResult(torch.full((3,), 0.5), *nothing, failures=known)
-    verifier.findings.search = found
+    verifier.state.search = found
     verifier.choose_spp({"clean": NAMED.start})
-    clean = tuple(StandInProblem().evaluate(Query(torch.zeros(6), seed)).said for seed in range(trials))
-    verifier.findings.clean = clean
-    check_failures(verifier, found)
+    clean = tuple(StandInProblem().evaluate(Query(torch.zeros(6), seed)).required_judgement for seed in range(trials))
+    verifier.state.clean_trials = clean
+    verify_failures(verifier, found)
     return verifier
 
 
@@ -65,7 +65,7 @@ def failures(*firsts: float) -> Failures:
 
 
 def described(verifier: Verifier) -> DifferentFailures:
-    told = described_failures(verifier.problem, verifier.findings)
+    told = describe_failures(verifier.problem, verifier.state)
     assert told is not None
     return told
 
@@ -82,9 +82,14 @@ def test_no_more_are_tried_than_is_said_and_the_rest_is_a_claim() -> None:
     told = described(checked(failures(*[0.95] * (MAX_TRIED_FAILURES + 3))))
     assert told.tried == MAX_TRIED_FAILURES
     assert [one.holds for one in told.listed[MAX_TRIED_FAILURES:]] == [None] * 3
-    assert failures_text(told).endswith(f"with fresh renders {MAX_TRIED_FAILURES} of the {MAX_TRIED_FAILURES} that were tried hold")
-    assert len(failures_part(told).rows) == MAX_TRIED_FAILURES + 3 and len(failures_part(told, tried=True).rows) == MAX_TRIED_FAILURES
-    assert failures_part(told).rows[-1][2] == "not tried"
+    assert failures_text(told).endswith(
+        f"with fresh renders {MAX_TRIED_FAILURES} of the {MAX_TRIED_FAILURES} that were tried hold"
+    )
+    assert (
+        len(make_failures_part(told).rows) == MAX_TRIED_FAILURES + 3
+        and len(make_failures_part(told, tried=True).rows) == MAX_TRIED_FAILURES
+    )
+    assert make_failures_part(told).rows[-1][2] == "not tried"
 
 
 def test_over_conditions_none_is_tried_and_that_is_said() -> None:
@@ -94,17 +99,17 @@ def test_over_conditions_none_is_tried_and_that_is_said() -> None:
 
 
 def test_without_cells_it_is_draws_and_the_share_of_all_that_fails() -> None:
-    share = FailureShare(0.034, (0.021, 0.08), 22.5, 500)
-    known = replace(failures(0.9), over=(), found=70, seen=500, places=None, share=share)
+    share = FailureRate(0.034, (0.021, 0.08), 22.5, 500)
+    known = replace(failures(0.9), over=(), n_failures=70, n_visited=500, n_cells=None, failure_rate=share)
     told = described(checked(known))
     assert failures_text(told).startswith(
         "claimed in 70 of 500 draws; of all configurations 2.1-8 % fail in one render (95 % interval), 3.4 % by the "
     )
     assert told.to_dict()["share"] == {"estimate": 0.034, "interval": [0.021, 0.08], "effective": 22.5, "draws": 500}
-    few = described(checked(replace(known, share=replace(share, estimate=None))))
+    few = described(checked(replace(known, failure_rate=replace(share, estimate=None))))
     assert "2.1-8 % fail in one render (95 % interval); with fresh" in failures_text(few)
     assert (
-        failures_part(described(checked(Failures((replace(failure(0.9), ranges={}),), (), 1, 9, None)))).rows[0][0]
+        make_failures_part(described(checked(Failures((replace(failure(0.9), ranges={}),), (), 1, 9, None)))).rows[0][0]
         == "anywhere"
     )
 
@@ -112,11 +117,11 @@ def test_without_cells_it_is_draws_and_the_share_of_all_that_fails() -> None:
 def test_ranges_are_in_units_and_a_choice_has_its_option() -> None:
     (one,) = described(checked(failures(0.9))).listed
     assert one.ranges == {"u.0": pytest.approx((76.5, 85.5)), "kind": "brass"}
-    assert failures_part(described(checked(failures(0.9)))).rows[0][0] == "u.0 76.5 to 85.5 degrees, kind brass"
+    assert make_failures_part(described(checked(failures(0.9)))).rows[0][0] == "u.0 76.5 to 85.5 degrees, kind brass"
 
 
 def test_a_policy_that_looks_for_one_failure_has_none_of_it() -> None:
-    assert described_failures(Coin(domain=NAMED), Findings()) is None  # type: ignore[arg-type]
+    assert describe_failures(Coin(domain=NAMED), RunState()) is None  # type: ignore[arg-type]
     assert "failures" not in attack().to_dict()
 
 

@@ -20,22 +20,29 @@ from advsearch.engine.gradients import (
     Probe,
     Reference,
     compare_with_reference,
+    find_interior_point,
     find_probes,
-    interior_point,
     list_attempts,
+    make_smooth_loss,
     measure_reference,
     restrict_plan,
-    smooth_loss,
 )
-from advsearch.engine.gradients.planning import TELLS, contested, cosines, measured_plan, status_of, tuned
+from advsearch.engine.gradients.planning import (
+    MIN_AGREEMENT,
+    choose_estimators,
+    choose_steps,
+    list_contested,
+    measure_cosines,
+    rate_cosine,
+)
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check import check
-from advsearch.questions.check.result import CheckConfig, shown
+from advsearch.questions.check.result import CheckConfig, make_check_view
 from advsearch.runs.results import Measured
 from advsearch.scene.formation import ImageFormation
-from advsearch.scene.gradients import ESTIMATORS, SEARCH_STEP, Group, first_plan
+from advsearch.scene.gradients import ESTIMATORS, SEARCH_STEP, Group, make_first_plan
 from advsearch.scene.renderer import Renderer
 
 SIZE = 48
@@ -44,7 +51,7 @@ SIZE = 48
 def renderer(controls: Any, *, object: str = "mug", transfer: str = "linear", **options: Any) -> Renderer:
     made = load_scene(object).renderer(controls, resolution=SIZE, denoise="none", **options)
     made.formation = replace(made.formation, transfer=transfer)
-    made.plan = made.plan.at_a_pixel()  # as `check` does for smooth losses, which these are
+    made.plan = made.plan.with_pixel_steps()  # as `check` does for smooth losses, which these are
     return made
 
 
@@ -63,13 +70,13 @@ def test_the_first_plan_takes_what_is_preferred_and_obeys_force() -> None:
         group("environment.which", 10, 1, ()),
     )
     steps = torch.full((11,), 0.02)
-    plan = first_plan(groups, steps)
+    plan = make_first_plan(groups, steps)
     assert [one.estimator for one in plan.groups] == ["secant", "adjoint", "none"]
-    assert plan.renders == 2 and plan.through.tolist() == [0.0] + [1.0] * 9 + [0.0]
-    forced = first_plan(groups, steps, {"pose": "material", "texture.texels": "secant"})
+    assert plan.renders == 2 and plan.autograd_mask.tolist() == [0.0] + [1.0] * 9 + [0.0]
+    forced = make_first_plan(groups, steps, {"pose": "material", "texture.texels": "secant"})
     assert [one.estimator for one in forced.groups] == ["material", "secant", "none"]
     assert "forced" in forced.groups[0].reason
-    everywhere = first_plan(groups, steps, {"*": "differences"})
+    everywhere = make_first_plan(groups, steps, {"*": "differences"})
     assert [one.estimator for one in everywhere.groups] == ["differences", "differences", "none"]
 
 
@@ -85,7 +92,7 @@ def test_the_first_plan_takes_what_is_preferred_and_obeys_force() -> None:
 )
 def test_an_estimator_that_cannot_be_is_refused(forced: dict[str, str], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        first_plan((group("pose.yaw", 0, 1, ("secant", "material")),), torch.zeros(1), forced)
+        make_first_plan((group("pose.yaw", 0, 1, ("secant", "material")),), torch.zeros(1), forced)
 
 
 def test_every_estimator_that_a_control_names_exists() -> None:
@@ -103,13 +110,13 @@ def test_every_estimator_that_a_control_names_exists() -> None:
 def test_differences_are_central_differences_of_the_picture_with_one_seed() -> None:
     render = renderer(["camera"], estimators={"*": "differences"})
     weights = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(1))
-    u = interior_point(render)
+    u = find_interior_point(render)
     leaf = u.clone().requires_grad_()
     before = render.renders
     (render(leaf, seed=3, spp=4) * weights).sum().backward()
     assert render.renders - before == 1 + 2 * len(u)
     first = render.plan.groups[1]
-    noise = render.differences(u, weights, 3, 4)
+    noise = render.compute_differences(u, weights, 3, 4)
     assert leaf.grad is not None and torch.equal(leaf.grad, noise)
     assert first.periodic is False
     step = torch.zeros_like(u)
@@ -124,23 +131,23 @@ def test_differences_are_central_differences_of_the_picture_with_one_seed() -> N
 
 def test_a_step_is_one_that_a_search_can_follow_and_never_under_a_pixel() -> None:
     both = torch.tensor([0.001, 0.1])
-    fast, slow = first_plan((group("a.b", 0, 1, ("secant",)), group("a.c", 1, 1, ("secant",))), both).groups
+    fast, slow = make_first_plan((group("a.b", 0, 1, ("secant",)), group("a.c", 1, 1, ("secant",))), both).groups
     assert fast.step == SEARCH_STEP and fast.pixel == pytest.approx(0.001) and slow.step == slow.pixel == both[1]
     assert fast.step_reason == "30 times as wide as moves an outline by a pixel, so that a search can follow"
     assert slow.step_reason == "an outline moves by a pixel, or nothing moves"
     for lit in (("adjoint", "differences"), ("image",)):  # what moves no outline is as it was
-        assert first_plan((group("a.b", 0, 1, lit),), both).groups[0].step == pytest.approx(0.001)
-    assert first_plan((group("a.b", 0, 2, ("secant",)),), both).groups[0].step == pytest.approx(0.001)
-    endless = first_plan((group("a.b", 0, 1, ("secant",)),), 1e-6 * both, across=100.0).groups[0]
+        assert make_first_plan((group("a.b", 0, 1, lit),), both).groups[0].step == pytest.approx(0.001)
+    assert make_first_plan((group("a.b", 0, 2, ("secant",)),), both).groups[0].step == pytest.approx(0.001)
+    endless = make_first_plan((group("a.b", 0, 1, ("secant",)),), 1e-6 * both, image_size=100.0).groups[0]
     assert endless.step == pytest.approx(0.4 * 100.0 * 1e-9)  # things stay in sight
-    narrow = first_plan((group("a.b", 0, 1, ("secant",)),), both).at_a_pixel()
+    narrow = make_first_plan((group("a.b", 0, 1, ("secant",)),), both).with_pixel_steps()
     assert narrow.groups[0].step == pytest.approx(0.001)
 
 
 def test_a_plan_says_its_steps_in_the_parameters_unit_and_why() -> None:
     config = AttackConfig(object="mug", controls={"camera": {"azimuth": [0, 360]}}, resolution=(32, 32))
     problem, _ = problem_from_config(config)
-    (found,) = problem.plan_summary(problem.plan).groups
+    (found,) = problem.summarize_plan(problem.plan).groups
     assert found.step == SEARCH_STEP and found.unit == "degrees"
     assert found.step_in_unit == pytest.approx(0.03 * 360.0, abs=0.01)
     assert "so that a search can follow" in found.step_reason
@@ -153,15 +160,15 @@ def test_the_azimuth_of_the_mug_has_the_sign_of_what_the_loss_does_over_degrees(
     renderer, start = problem.renderer, problem.domain.start
     steps = [half * degrees / 360.0 for half in (1.0, -1.0) for degrees in (7.2, 10.8, 18.0)]
     with torch.no_grad():
-        seen = [float(problem.loss(renderer((start + step) % 1.0, seed=9, spp=64))) for step in steps]
+        seen = [float(problem.compute_loss(renderer((start + step) % 1.0, seed=9, spp=64))) for step in steps]
     slope = sum(seen[:3]) - sum(seen[3:])
     for seed in range(6):
-        assert float(renderer.gradient(problem.loss, start, seed, 8)[1][0]) * slope > 0.0
+        assert float(renderer.gradient(problem.compute_loss, start, seed, 8)[1][0]) * slope > 0.0
 
 
 def test_a_secant_differences_the_loss_itself() -> None:
     render = renderer(["camera.elevation"], estimators={"*": "secant"}, transfer="srgb")
-    u = interior_point(render)
+    u = find_interior_point(render)
 
     def bent(image: Tensor) -> Tensor:
         return torch.sigmoid(30.0 * (image.mean() - 0.45))
@@ -179,7 +186,7 @@ def test_a_secant_differences_the_loss_itself() -> None:
 def test_differences_at_the_edge_of_the_box_stay_inside_and_are_finite() -> None:
     render = renderer({"camera": {"elevation": [5, 60], "azimuth": [0, 360]}}, estimators={"*": "differences"})
     for corner in (torch.zeros(2), torch.ones(2)):
-        _, gradient = render.gradient(smooth_loss((SIZE, SIZE)), corner, 0, 4)
+        _, gradient = render.gradient(make_smooth_loss((SIZE, SIZE)), corner, 0, 4)
         assert bool(torch.isfinite(gradient).all()) and bool(gradient.any())
 
 
@@ -193,8 +200,8 @@ def test_a_full_turn_meets_itself() -> None:
 
 def test_the_free_part_of_a_gradient_takes_no_render_of_its_own() -> None:
     render = renderer({"environment": {"exposure": [-1, 1]}, "camera": {"elevation": [5, 60]}})
-    u, before = interior_point(render), render.renders
-    _, free = render.gradient(smooth_loss((SIZE, SIZE)), u, 0, 4, free=True)
+    u, before = find_interior_point(render), render.renders
+    _, free = render.gradient(make_smooth_loss((SIZE, SIZE)), u, 0, 4, free=True)
     assert render.renders - before == 1
     assert float(free[0]) != 0.0 and float(free[1]) == 0.0
 
@@ -204,14 +211,14 @@ def test_a_texture_beside_a_pose_is_differentiated_once_and_nothing_geometric_fo
 ) -> None:
     render = renderer({"texture": {"resolution": 16}, "pose": {"yaw": [0, 360]}})
     asked: list[tuple[str, ...]] = []
-    original = render.scene.adjoint
+    original = render.scene.render_adjoint
 
     def spy(inputs: Any, cotangent: Tensor, seed: int, spp: int, *, wrt: Any = None, method: str = "path") -> Any:
         asked.append((method, *wrt))
         return original(inputs, cotangent, seed, spp, wrt=wrt, method=method)
 
     monkeypatch.setattr(render.scene, "adjoint", spy)
-    _, gradient = render.gradient(smooth_loss((SIZE, SIZE)), interior_point(render), 0, 4)
+    _, gradient = render.gradient(make_smooth_loss((SIZE, SIZE)), find_interior_point(render), 0, 4)
     assert asked == [("path", "object.base_color")]
     assert bool(gradient[:-1].any()) and float(gradient[-1]) != 0.0
 
@@ -220,9 +227,9 @@ def test_a_texture_beside_a_pose_is_differentiated_once_and_nothing_geometric_fo
 def test_turning_an_environment_has_the_right_sign_and_size() -> None:
     """Mitsuba's own derivative of `to_world` has the wrong sign (docs/gradients.md); texels have the right one."""
     render = renderer(["environment.rotation"])
-    bench = Bench(render, smooth_loss((SIZE, SIZE)), interior_point(render), seed=0, spp=64)
+    bench = Bench(render, make_smooth_loss((SIZE, SIZE)), find_interior_point(render), seed=0, spp=64)
     by_adjoint = restrict_plan(render.plan, [render.plan.groups[0].name], "adjoint")
-    adjoint = torch.stack([replace(bench, spp=128).gradient(by_adjoint, seed) for seed in range(6)]).mean()
+    adjoint = torch.stack([replace(bench, spp=128).compute_gradient(by_adjoint, seed) for seed in range(6)]).mean()
     (probe,) = find_probes(bench)
     truth = measure_reference(bench, probe)
     assert float(adjoint) * truth.value > 0.0
@@ -234,9 +241,9 @@ def test_turning_an_environment_has_the_right_sign_and_size() -> None:
 def test_the_adjoint_of_a_surface_agrees_with_differences_to_a_twentieth(parameter: str, share: float) -> None:
     """To a looser bound, with fewer samples, in tests/controls/test_control_material.py."""
     render = renderer({"material": {parameter: [0.1, 0.9]}})
-    bench = Bench(render, smooth_loss((SIZE, SIZE)), torch.tensor([share]), seed=0, spp=256)
+    bench = Bench(render, make_smooth_loss((SIZE, SIZE)), torch.tensor([share]), seed=0, spp=256)
     adjoint = restrict_plan(render.plan, [render.plan.groups[0].name], "adjoint")
-    values = torch.stack([replace(bench, spp=128).gradient(adjoint, seed) for seed in range(6)]).flatten()
+    values = torch.stack([replace(bench, spp=128).compute_gradient(adjoint, seed) for seed in range(6)]).flatten()
     (probe,) = find_probes(bench)
     truth = measure_reference(bench, probe)
     doubt = 3.0 * math.hypot(float(values.std()) / math.sqrt(len(values)), truth.noise)
@@ -375,8 +382,8 @@ def test_a_wider_step_of_one_gradient_leaves_the_plan_as_it_was() -> None:
         return image.sum()
 
     before = render.plan
-    Bench(render, loss, interior_point(render), seed=0, spp=1).gradient(
-        restrict_plan(before.with_steps(3.0), ["pose.yaw"], "secant"), 0
+    Bench(render, loss, find_interior_point(render), seed=0, spp=1).compute_gradient(
+        restrict_plan(before.scale_steps(3.0), ["pose.yaw"], "secant"), 0
     )
     assert render.plan is before
     assert max(steps) == pytest.approx(3.0 * before.groups[0].step)
@@ -385,20 +392,22 @@ def test_a_wider_step_of_one_gradient_leaves_the_plan_as_it_was() -> None:
 @pytest.mark.medium
 def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> None:
     render = renderer({"environment": {"rotation": [0, 360], "exposure": [-1, 1]}})
-    plan = measured_plan(Bench(render, smooth_loss((SIZE, SIZE)), interior_point(render), seed=0, spp=4), repeats=2)
+    plan = choose_estimators(
+        Bench(render, make_smooth_loss((SIZE, SIZE)), find_interior_point(render), seed=0, spp=4), repeats=2
+    )
     for one in plan.groups:
         assert set(one.measured) == {"adjoint", "differences"}
         assert one.estimator == min(one.measured, key=lambda name: one.measured[name])
         assert "least squared error x time" in one.reason
     forced = renderer({"environment": {"rotation": [0, 360]}}, estimators={"environment": "adjoint"})
-    assert contested(forced.plan) == []
+    assert list_contested(forced.plan) == []
 
 
 def test_a_loss_that_is_flat_keeps_what_is_preferred() -> None:
     """As of a detector that sees nothing with the right name: all gradients are nil, and none has an error."""
     render = renderer({"environment": {"exposure": [-1, 1]}})
-    plan = measured_plan(
-        Bench(render, lambda image: 0.0 * image.sum(), interior_point(render), seed=0, spp=2), repeats=2
+    plan = choose_estimators(
+        Bench(render, lambda image: 0.0 * image.sum(), find_interior_point(render), seed=0, spp=2), repeats=2
     )
     (one,) = plan.groups
     assert set(one.measured.values()) == {0.0}
@@ -410,13 +419,15 @@ def test_a_loss_that_is_flat_keeps_what_is_preferred() -> None:
 
 def test_over_many_coordinates_an_adjoint_is_not_compared_with_differences() -> None:
     many, few = (
-        first_plan((group("geometry.amplitudes", 0, size, ("material", "differences")),), torch.full((size,), 0.01))
+        make_first_plan(
+            (group("geometry.amplitudes", 0, size, ("material", "differences")),), torch.full((size,), 0.01)
+        )
         for size in (24, 8)
     )
-    assert contested(many) == contested(many, every=True) == []
+    assert list_contested(many) == list_contested(many, with_all=True) == []
     assert list_attempts(many.groups[0]) == [("material", 1.0)]
-    assert contested(few) == []  # material is preferred, unless all are to be compared
-    assert contested(few, every=True) == [(few.groups, ("material", "differences"))]
+    assert list_contested(few) == []  # material is preferred, unless all are to be compared
+    assert list_contested(few, with_all=True) == [(few.groups, ("material", "differences"))]
 
 
 class Told:
@@ -425,7 +436,7 @@ class Told:
     formation = ImageFormation()
 
     def __init__(self, gradients: dict[int, list[list[float]]]) -> None:
-        self.plan = first_plan((group("haze.density", 0, 2, ("adjoint",)),), torch.tensor([0.01, 0.01]))
+        self.plan = make_first_plan((group("haze.density", 0, 2, ("adjoint",)),), torch.tensor([0.01, 0.01]))
         self.gradients, self.asked = gradients, list[int]()
 
     def gradient(self, loss: Any, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor]:
@@ -442,18 +453,18 @@ def test_converged_gradients_of_which_one_disagrees_get_more_samples() -> None:
     """Two of three agree to 1 here, as they do by luck where there are few numbers."""
     right, wrong = [1.0, 0.0], [-1.0, 0.1]
     told: Any = Told({128: [right, right, wrong], 512: [right], 8: [right]})
-    (row,) = cosines(bench_of(told), counts=(8,))
+    (row,) = measure_cosines(bench_of(told), counts=(8,))
     assert told.asked == [128, 128, 128, 512, 512, 512, 8, 8, 8]
     assert (row.status, row.cosine, row.reference_cosine) == ("ok", 1.0, 1.0)
     agreed: Any = Told({128: [right], 8: [right]})
-    list(cosines(bench_of(agreed), counts=(8,)))
+    list(measure_cosines(bench_of(agreed), counts=(8,)))
     assert 512 not in agreed.asked
 
 
 def test_a_working_gradient_is_not_held_against_one_of_fewer_samples() -> None:
     right, across = [1.0, 0.0], [0.0, 1.0]
     told: Any = Told({128: [across], 512: [right], 64: [right], 256: [right]})
-    dear = cosines(bench_of(told), counts=(64, 256))
+    dear = measure_cosines(bench_of(told), counts=(64, 256))
     assert [(row.spp, row.cosine) for row in dear] == [(64, 0.0), (256, 1.0)]
 
 
@@ -462,8 +473,8 @@ def test_the_widest_step_is_tried_only_where_no_other_will_do() -> None:
 
     def factors(working: list[list[float]], step: float = 0.01) -> list[float]:
         told: Any = Told({128: [right], 8: working})
-        told.plan = first_plan((group("pose.x", 0, 2, ("secant",)),), torch.tensor([step, step]))
-        return [row.factor for row in cosines(bench_of(told), counts=(8,))]
+        told.plan = make_first_plan((group("pose.x", 0, 2, ("secant",)),), torch.tensor([step, step]))
+        return [row.factor for row in measure_cosines(bench_of(told), counts=(8,))]
 
     assert factors([right]) == [1.0, 3.0]
     assert factors([across]) == [1.0, 3.0, 9.0]
@@ -471,7 +482,7 @@ def test_the_widest_step_is_tried_only_where_no_other_will_do() -> None:
 
 
 def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:
-    plan = first_plan((group("pose.yaw", 0, 1, ("secant",)),), torch.tensor([0.01]))
+    plan = make_first_plan((group("pose.yaw", 0, 1, ("secant",)),), torch.tensor([0.01]))
     place: Any = {
         "quantity": "gradient",
         "estimator": "secant",
@@ -484,13 +495,13 @@ def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:
         Measured(factor=1.0, spp=64, cosine=0.95, seconds=8.0, status="ok", **place),
         Measured(factor=3.0, spp=16, cosine=0.93, seconds=2.0, status="ok", **place),
     ]
-    chosen, spp = tuned(plan, rows)
+    chosen, spp = choose_steps(plan, rows)
     assert spp == 16 and chosen.groups[0].step == pytest.approx(3.0 * SEARCH_STEP)
     luck = rows[1].model_copy(update={"spp": 16, "cosine": 0.91, "seconds": 0.1})
-    assert tuned(plan, [luck, rows[2]])[0] == tuned(plan, [rows[2]])[0]  # times are of the machine
-    poor, spp = tuned(plan, rows[:1])
+    assert choose_steps(plan, [luck, rows[2]])[0] == choose_steps(plan, [rows[2]])[0]  # times are of the machine
+    poor, spp = choose_steps(plan, rows[:1])
     assert spp == 8 and "below 0.9, the best that was found" in poor.groups[0].reason
-    assert tuned(plan, [])[1] is None
+    assert choose_steps(plan, [])[1] is None
 
 
 @pytest.mark.parametrize(
@@ -505,11 +516,11 @@ def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:
     ],
 )
 def test_a_cosine_counts_only_where_converged_gradients_agree(cosine: float, converged: float, status: str) -> None:
-    assert status_of(cosine, converged) == status
+    assert rate_cosine(cosine, converged) == status
 
 
 def test_a_noisy_reference_only_lowers_a_cosine() -> None:
-    """The bound of `TELLS`: working gradients of cosine 0.95 with the truth, references of noise as large as makes two
+    """The bound of `MIN_AGREEMENT`: working gradients of cosine 0.95 with the truth, references of noise as large as makes two
     agree to a half. What is measured stays below, and below the bound times 0.95."""
     generator = torch.Generator().manual_seed(3)
     truth, n = torch.randn(50, generator=generator), 50
@@ -519,7 +530,9 @@ def test_a_noisy_reference_only_lowers_a_cosine() -> None:
         working = truth + 0.33 * noise * torch.randn(n, generator=generator)
         one, other = (truth + noise * torch.randn(n, generator=generator) for _ in range(2))
         measured.append(float(torch.cosine_similarity(working, (one + other) / 2.0, dim=0)))
-    assert sum(measured) / len(measured) == pytest.approx(0.95 * (2 * TELLS / (1 + TELLS)) ** 0.5, abs=0.02)
+    assert sum(measured) / len(measured) == pytest.approx(
+        0.95 * (2 * MIN_AGREEMENT / (1 + MIN_AGREEMENT)) ** 0.5, abs=0.02
+    )
 
 
 # ---- settings of controls -------------------------------------------------------------------------------------------
@@ -579,16 +592,16 @@ def test_the_start_is_the_scene_as_it_is() -> None:
 
 
 def test_a_rotation_vector_is_a_rotation_with_a_derivative_at_zero() -> None:
-    from advsearch.scene.geometry import euler, rotation_vector
+    from advsearch.scene.geometry import make_euler_rotation, make_vector_rotation
 
     for degrees in ([0.0, 0.0, 0.0], [0.0, 0.0, 90.0], [100.0, -60.0, 45.0], [180.0, 0.0, 0.0]):
         vector = torch.tensor(degrees, requires_grad=True)
-        matrix = rotation_vector(vector)
+        matrix = make_vector_rotation(vector)
         assert torch.allclose(matrix @ matrix.T, torch.eye(3), atol=1e-5)
         (gradient,) = torch.autograd.grad((matrix * torch.arange(9.0).reshape(3, 3)).sum(), vector)
         assert bool(torch.isfinite(gradient).all()) and bool(gradient.any())
-    turned = euler(torch.tensor(30.0), torch.tensor(0.0), torch.tensor(0.0))
-    assert torch.allclose(rotation_vector(torch.tensor([0.0, 0.0, 30.0])), turned, atol=1e-6)
+    turned = make_euler_rotation(torch.tensor(30.0), torch.tensor(0.0), torch.tensor(0.0))
+    assert torch.allclose(make_vector_rotation(torch.tensor([0.0, 0.0, 30.0])), turned, atol=1e-6)
 
 
 def test_a_lens_keeps_what_it_frames() -> None:
@@ -638,7 +651,7 @@ def test_what_the_ground_hides_is_not_followed() -> None:
 
 
 def test_the_smooth_loss_does_not_see_the_edge_of_the_picture() -> None:
-    loss = smooth_loss((SIZE, SIZE), seed=3)
+    loss = make_smooth_loss((SIZE, SIZE), seed=3)
     picture = torch.rand(SIZE, SIZE, 3)
     framed = picture.clone()
     framed[0], framed[-1], framed[:, 0], framed[:, -1] = 100.0, 100.0, 100.0, 100.0
@@ -663,11 +676,11 @@ def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> N
     assert {row.control for row in whole} == {"background"} and whole[0].estimator in ESTIMATORS
     last = whole[-1]
     assert last.cosine is not None and last.reference_cosine is not None
-    assert (last.status == "ok") == (last.cosine >= 0.9 and last.reference_cosine >= TELLS)
+    assert (last.status == "ok") == (last.cosine >= 0.9 and last.reference_cosine >= MIN_AGREEMENT)
     single = {row.parameter: row for row in rows if row.loss == "model" and row.quantity == "derivative"}
     assert set(single) == {row.parameter for row in linear}
     for row in single.values():
         assert None not in (row.noise, row.reference_error, row.bias) and math.isfinite(row.value or 0.0)
         assert row.status in ("ok", "noisy", "biased", "reference unusable")
-    text = " ".join(one.title for one in shown(checked).sections if not one.empty)
+    text = " ".join(one.title for one in make_check_view(checked).sections if not one.empty)
     assert "Smooth linear loss" in text and "each parameter" in text and "cosine with the converged" in text

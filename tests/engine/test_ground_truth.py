@@ -45,7 +45,7 @@ def test_an_attack_keeps_ground_truth_of_the_clean_scene_and_of_its_adversarial_
     for name, u in (("clean", render.start), ("adversarial", found.u)):
         with OpenEXR.File(str(run / "images" / f"{name}.aov.exr"), separate_channels=True) as picture:
             layers, header = {key: one.pixels for key, one in picture.channels().items()}, dict(picture.header())
-        expected = render.surfaces(u).layers(names.split(","), "object")
+        expected = render.surfaces(u).make_layers(names.split(","), "object")
         assert sorted(layers) == sorted(expected) and "metres" in header["depth"]
         for key, value in expected.items():
             assert np.array_equal(layers[key], value.numpy()), key

@@ -14,7 +14,7 @@ import advsearch
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.tasks.base import Facts, Sight
 from advsearch.tasks.segmentation import Segmentation
-from advsearch.tasks.together import each_thing
+from advsearch.tasks.together import make_each_thing_task
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -77,9 +77,11 @@ def test_names_of_what_is_judged_are_checked_before_anything_is_rendered() -> No
 def test_all_things_have_to_be_right() -> None:
     masks = {"object": torch.zeros(2, 4, dtype=torch.bool), "sign": torch.zeros(2, 4, dtype=torch.bool)}
     masks["object"][:, :2], masks["sign"][:, 2:] = True, True
-    own = each_thing(Segmentation(labels=("car", "sign"), accuracy=1.0))
+    own = make_each_thing_task(Segmentation(labels=("car", "sign"), accuracy=1.0))
     each = {
-        name: Facts(name, name if name == "sign" else "car", look=partial(Sight, mask, mask.float(), mask.float()))
+        name: Facts(
+            name, name if name == "sign" else "car", compute_sight=partial(Sight, mask, mask.float(), mask.float())
+        )
         for name, mask in masks.items()
     }
     truth = own.truth(Facts("car", "car", each=each))

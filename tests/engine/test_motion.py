@@ -13,10 +13,10 @@ from torch.nn.functional import avg_pool2d
 from advsearch import seeds
 from advsearch.controls import compose
 from advsearch.controls.path import PathControl
-from advsearch.engine.loading import as_controls, make_renderer
+from advsearch.engine.loading import make_controls, make_renderer
 from advsearch.errors import InputError
-from advsearch.scene.description import describe
-from advsearch.scene.formation import Moment, moments_of
+from advsearch.scene.description import load_description
+from advsearch.scene.formation import Moment, divide_exposure
 from advsearch.scene.renderer import Renderer
 
 SIDE, SECONDS = 48, 2.0
@@ -26,7 +26,7 @@ DRIVE: dict[str, Any] = {"path": "orbit", "seconds": SECONDS, "time": 0.9}
 
 
 def renderer(controls: list[Any], denoise: str = "none") -> Renderer:
-    scene = describe("mug")
+    scene = load_description("mug")
     return make_renderer(scene, compose(controls, scene), SIDE, denoise, 0)
 
 
@@ -46,7 +46,7 @@ def levels(radiance: Tensor, like: Renderer) -> Tensor:
     ("shutter", "rolling"), [(0.1, 0.0), (0.0, 0.1), (0.03, 0.1), (0.1, 0.03), (0.0, -0.1), (0.03, -0.1)]
 )
 def test_every_row_is_exposed_around_its_own_time_and_as_long(shutter: float, rolling: float, count: int) -> None:
-    offsets, rows, samples = moments_of(shutter, rolling, 20, count)
+    offsets, rows, samples = divide_exposure(shutter, rolling, 20, count)
     torch.testing.assert_close(rows.sum(dim=0), torch.ones(20))
     assert (rows >= 0.0).all() and 0.0 < samples <= 1.0 and float(offsets.sum()) == pytest.approx(0.0, abs=1e-12)
     middle = (offsets[:, None] * rows).sum(dim=0)
@@ -89,27 +89,29 @@ def test_rows_that_are_read_one_after_the_other_are_those_of_as_many_stills(
     rolled = renderer([PathControl(**DRIVE, rolling=0.1)])
     times = [0.9 + 0.1 * ((row + 0.5) / SIDE - 0.5) for row in range(SIDE)]
     rows = torch.stack([stills(time, 4, seeds.stream(1, "moment", row))[row] for row, time in enumerate(times)])
-    own = compose([PathControl(**DRIVE, rolling=0.1)], describe("mug"))
-    offsets, shares, samples = moments_of(0.0, 0.1, SIDE, SIDE)
-    rolled.moments = tuple(Moment(own.later(float(at)), one, samples) for at, one in zip(offsets, shares, strict=True))
+    own = compose([PathControl(**DRIVE, rolling=0.1)], load_description("mug"))
+    offsets, shares, samples = divide_exposure(0.0, 0.1, SIDE, SIDE)
+    rolled.moments = tuple(
+        Moment(own.advance_time(float(at)), one, samples) for at, one in zip(offsets, shares, strict=True)
+    )
     off = (rolled(rolled.start, 1, 4) - levels(rows, rolled)).abs()
     assert float(off.max()) < LEVELS
     assert float((levels(stills(0.9, 64, 5), rolled) - levels(rows, rolled)).abs().max()) > 20 * LEVELS
 
 
 def test_rows_that_are_read_from_the_bottom_are_those_of_a_picture_upside_down() -> None:
-    down, up = (compose([PathControl(**DRIVE, rolling=seconds)], describe("mug")) for seconds in (0.1, -0.1))
+    down, up = (compose([PathControl(**DRIVE, rolling=seconds)], load_description("mug")) for seconds in (0.1, -0.1))
     assert down.exposure == (0.0, 0.1) and up.exposure == (0.0, -0.1)
     assert float(DRIVE.get("shutter", 0.0)) == 0.0
-    offsets, rows, samples = moments_of(0.0, 0.1, 12, 5)
-    other_offsets, other_rows, other_samples = moments_of(0.0, -0.1, 12, 5)
+    offsets, rows, samples = divide_exposure(0.0, 0.1, 12, 5)
+    other_offsets, other_rows, other_samples = divide_exposure(0.0, -0.1, 12, 5)
     torch.testing.assert_close(other_offsets, offsets)
     torch.testing.assert_close(other_rows, rows.flip(1))
     assert samples == other_samples and float(other_rows[0].argmax()) > float(other_rows[-1].argmax())
     first, last = (renderer([PathControl(**DRIVE, rolling=seconds)]).moments for seconds in (0.1, -0.1))
     assert len(first) == len(last)
     for one, other in zip(first, last, strict=True):
-        torch.testing.assert_close(other.rows, one.rows.flip(0))
+        torch.testing.assert_close(other.row_fractions, one.row_fractions.flip(0))
 
 
 @pytest.mark.slow
@@ -124,7 +126,7 @@ def test_fewer_moments_than_rows_are_close_to_it(stills: Callable[[float, int, i
 
 @pytest.mark.medium
 def test_a_derivative_of_a_texture_is_that_of_the_mean() -> None:
-    moving = renderer([PathControl(**DRIVE, shutter=0.05), *as_controls({"texture": {}})])
+    moving = renderer([PathControl(**DRIVE, shutter=0.05), *make_controls({"texture": {}})])
     weight = torch.rand(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(0)).double()
     u = moving.start.clamp(0.1, 0.9).requires_grad_()
     (gradient,) = torch.autograd.grad((weight * moving.radiance(u, 1, 64)).sum(), u)

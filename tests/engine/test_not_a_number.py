@@ -13,7 +13,7 @@ from torch import Tensor, nn
 import advsearch
 import samples
 from advsearch.attacks import Trials
-from advsearch.engine.record import control_group, judgement_of, rate_of, trial_row
+from advsearch.engine.record import make_control_group, make_rate, make_trial_row, read_judgement
 from advsearch.errors import InputError
 from advsearch.options import Outcome
 from advsearch.questions.attack import wording
@@ -26,22 +26,22 @@ RIGHT, WRONG = Judgement.of(-1.0, -1.0, Prediction("mug", 1, 0.9)), Judgement.of
 
 
 def test_a_row_has_no_name_and_comes_back_as_what_it_was() -> None:
-    row = trial_row("verification", 0, 1, 4, NOTHING)
+    row = make_trial_row("verification", 0, 1, 4, NOTHING)
     assert (row.label, row.label_index, row.margin, row.objective, row.probability) == (None,) * 5
     assert row.correct is False and row.success is False
-    again = judgement_of(row)
-    assert again.not_a_number and again.prediction == NOTHING.prediction == Prediction("not a number")
-    assert not judgement_of(trial_row("verification", 0, 1, 4, RIGHT)).not_a_number
+    again = read_judgement(row)
+    assert again.is_not_a_number and again.prediction == NOTHING.prediction == Prediction("not a number")
+    assert not read_judgement(make_trial_row("verification", 0, 1, 4, RIGHT)).is_not_a_number
 
 
 def test_trials_without_a_number_are_counted_and_means_are_of_the_others() -> None:
     trials = [NOTHING, WRONG, RIGHT, NOTHING]
-    rate = rate_of(Trials(1, 4, 16), trials, [WRONG])
+    rate = make_rate(Trials(1, 4, 16), trials, [WRONG])
     assert (rate.not_a_number, rate.margin, rate.labels) == (2, -1.0, {"vase": 1})
-    control = control_group(trials, 16)
+    control = make_control_group(trials, 16)
     assert (control.correct, control.trials, control.not_a_number) == (1, 4, 2)
-    assert math.isnan(rate_of(Trials(0, 2, 16), [NOTHING, NOTHING], []).margin)
-    assert "not_a_number" not in rate_of(Trials(1, 2, 16), [WRONG, RIGHT], [WRONG]).to_dict()
+    assert math.isnan(make_rate(Trials(0, 2, 16), [NOTHING, NOTHING], []).margin)
+    assert "not_a_number" not in make_rate(Trials(1, 2, 16), [WRONG, RIGHT], [WRONG]).to_dict()
 
 
 def told(successes: int, nothing: int) -> AttackSummary:
@@ -69,7 +69,7 @@ def test_a_clean_scene_without_a_number_is_said_as_such() -> None:
     verdict = wording.attack_verdict(samples.attack(ending="already wrong", clean=clean))
     assert verdict.startswith("The model already predicts nothing for this mug, for its output is not a number")
     clean["control"] = {**clean["control"], "correct": 17, "not_a_number": 2}
-    (first, *_) = wording.remarks(samples.attack(clean=clean))
+    (first, *_) = wording.make_remarks(samples.attack(clean=clean))
     assert "fails 3 of its 20 trials; in 2 the output is not a number." in first
     for task in ("classification", "detection", "segmentation", "depth"):
         assert (

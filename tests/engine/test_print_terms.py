@@ -10,12 +10,12 @@ import torch
 
 import advsearch
 from advsearch.cli.output import shown_text as text_of
-from advsearch.engine.judging import off_print, variation
+from advsearch.engine.judging import mean_variation, printable_distance
 from advsearch.errors import InputError
 from advsearch.progress import Stages
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.wording import method_facts, print_cost_text, renders_text
+from advsearch.questions.attack.wording import method_texts, print_cost_text, renders_text
 from covering import only
 from small_models import easy
 
@@ -27,10 +27,10 @@ SHORT: dict[str, Any] = {
 
 def test_one_colour_is_smooth_and_the_set_is_printable() -> None:
     flat = torch.full((4, 4, 3), 0.3)
-    assert float(variation(flat)) == 0.0 and float(off_print(flat)) == pytest.approx(0.0, abs=1e-6)
-    assert float(off_print(torch.ones(2, 2, 3))) == pytest.approx(0.1 * 3**0.5)
+    assert float(mean_variation(flat)) == 0.0 and float(printable_distance(flat)) == pytest.approx(0.0, abs=1e-6)
+    assert float(printable_distance(torch.ones(2, 2, 3))) == pytest.approx(0.1 * 3**0.5)
     board = torch.tensor([[0.0, 1.0], [0.0, 1.0]])[..., None].expand(2, 2, 3)
-    assert float(variation(board)) == pytest.approx(0.5)  # half of the pixels have a neighbour of another colour
+    assert float(mean_variation(board)) == pytest.approx(0.5)  # half of the pixels have a neighbour of another colour
 
 
 @pytest.mark.medium
@@ -41,8 +41,8 @@ def test_predictions_are_nearer_to_ink() -> None:
     assert found is not None and found.answer is not None and without.summary.printability is None
     plain = without.artifacts["texture"]
     cost = found.answer.variation + found.answer.off_print
-    assert cost < 0.6 * float(variation(plain) + off_print(plain))
-    assert found.answer.off_print < 0.3 * float(off_print(plain))
+    assert cost < 0.6 * float(mean_variation(plain) + printable_distance(plain))
+    assert found.answer.off_print < 0.3 * float(printable_distance(plain))
     assert with_terms.found and without.found
     clean = with_terms.artifacts["texture-original"]
     priced = found.cost
@@ -58,9 +58,9 @@ def test_predictions_are_nearer_to_ink() -> None:
     assert f"{spent['unprinted']} of the search without print terms" in renders_text(with_terms.summary)
     said = print_cost_text(with_terms.summary)
     assert said.endswith(f"(another search of 30 steps, 6 trials each): they cost {priced.cost:.3g} logits")
-    assert method_facts(with_terms.summary)["Cost of printability"] == said and said in text_of(with_terms.summary)
+    assert method_texts(with_terms.summary)["Cost of printability"] == said and said in text_of(with_terms.summary)
     assert print_cost_text(without.summary) == ""
-    assert found.clean.variation == pytest.approx(float(variation(clean)), rel=1e-4)
+    assert found.clean.variation == pytest.approx(float(mean_variation(clean)), rel=1e-4)
 
 
 @pytest.mark.medium

@@ -19,7 +19,7 @@ import pytest
 import torch
 
 from advsearch.attacks import Domain, Evaluated, Evaluation, Policy, Proposal, Query, make_policy
-from advsearch.engine.journal import Journal, Shared
+from advsearch.engine.journal import Journal, ParallelEvaluator
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack.settings import AttackConfig
@@ -132,7 +132,7 @@ def test_an_interrupt_of_the_check_keeps_the_configuration_and_going_on_verifies
     assert torch.equal(stopped.search.best_u, whole.search.best_u)
     resumed = carry_out(tmp_path / "run", config, resume=True)
     assert resumed.verification is not None and whole.verification is not None
-    assert resumed.verification.adversarial == whole.verification.adversarial
+    assert resumed.verification.adversarial_counts == whole.verification.adversarial_counts
     assert rows(tmp_path / "run") == rows(tmp_path / "whole")
     once_each = [number for kind, number in answered if kind == "control"]
     assert once_each == list(range(config.trial_count)), "what was tried is not tried again"
@@ -142,14 +142,14 @@ def test_another_configuration_than_was_stored_is_refused(tmp_path: Path) -> Non
     with RunDirectory.create(tmp_path / "run") as run:
         problem: Any = StandInProblem()
         query = Query(torch.full((6,), 0.5), 1, phase="search")
-        (found,) = Journal(run, Shared(problem)).evaluate_all([query])
-        (again,) = Journal(run, Shared(problem)).evaluate_all([query])
+        (found,) = Journal(run, ParallelEvaluator(problem)).evaluate_all([query])
+        (again,) = Journal(run, ParallelEvaluator(problem)).evaluate_all([query])
         assert again.objective == found.objective
         for other in (replace(query, u=torch.full((6,), 0.4)), replace(query, seed=2)):
             with pytest.raises(
                 InputError, match="cannot resume: evaluation 0 of the search is not the one that was stored"
             ):
-                list(Journal(run, Shared(problem)).evaluate_all([other]))
+                list(Journal(run, ParallelEvaluator(problem)).evaluate_all([other]))
 
 
 CHANGES: dict[str, Any] = {
@@ -273,7 +273,7 @@ def test_the_random_searchs_configuration_is_taken_where_it_is_the_worse_one(pol
     config = configuration().model_copy(update={"steps": 200})
     findings = attack_on(problem, config, policy, Stages(NullProgress()))
     assert findings.search is not None and findings.baseline is not None and findings.verification is not None
-    assert (findings.beaten is not None) == beaten
+    assert (findings.outdone_verification is not None) == beaten
     random = findings.baseline.best_u
     assert torch.equal(findings.search.best_u, random) == beaten
     assert torch.equal(findings.verification.u, problem.domain.project(random)) == beaten
@@ -295,7 +295,7 @@ def test_a_run_that_was_killed_before_it_had_results_goes_on(tmp_path: Path) -> 
         pass
     (folder / "results.sqlite").unlink()
     with RunDirectory.resume(folder, configuration()) as run:
-        assert run.store.noted("settings") == configuration().deciding()
+        assert run.store.noted("settings") == configuration().get_deciding_settings()
     with closing(sqlite3.connect(tmp_path / "results.sqlite")) as made:
         made.execute(f"PRAGMA application_id = {files.APPLICATION_ID}")
         made.execute("CREATE TABLE others (text)")
@@ -306,7 +306,7 @@ def test_a_run_that_was_killed_before_it_had_results_goes_on(tmp_path: Path) -> 
 
 
 def test_a_run_that_was_killed_before_its_notes_knows_what_exists_only_in_python(tmp_path: Path) -> None:
-    config = configuration().with_only_here([PythonOnly("scene")])
+    config = configuration().with_python_only_parts([PythonOnly("scene")])
     with RunDirectory.create(tmp_path / "run", config=config):
         pass
     (tmp_path / "run" / "results.sqlite").unlink()

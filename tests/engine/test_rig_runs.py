@@ -23,7 +23,7 @@ from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.runs.store import NAME, Store
-from advsearch.scene.geometry import camera_to_world, middle, object_to_world
+from advsearch.scene.geometry import camera_to_world, compute_center, object_to_world
 from advsearch.tasks import make_task
 from conftest import ROOT
 
@@ -106,7 +106,7 @@ def test_every_picture_has_the_box_of_an_independent_projection(tmp_path: Path, 
     )  # fmt: skip
     scene = advsearch.load_scene("mug", camera=file).description
     vertices = scene.object.mesh.vertices.astype(np.float64)
-    centre, metres, fov = middle(scene), scene.metres, scene.number("camera.fov")
+    centre, metres, fov = compute_center(scene), scene.metres, scene.number("camera.fov")
     for row, yaw in zip(swept.rows(), (0.0, 50.0), strict=True):
         payload: Any = row.payload
         assert row.correct and len(payload["pictures"]) == len(scene.rig)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.errors import FileFormatError, InputError
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.scene.geometry import camera_to_world, middle, rotation
+from advsearch.scene.geometry import camera_to_world, compute_center, make_rotation
 from advsearch.scene.rig import read_rig
 from advsearch.tasks import make_task
 
@@ -74,9 +74,9 @@ def test_each_camera_takes_the_picture_that_it_takes_alone(tmp_path: Path, kind:
     assert seen.shape == (32, 64, 3)
     torch.testing.assert_close(seen[:, :32], own, atol=0.0, rtol=0.0)
     assert float((seen[:, 32:] - own).abs().mean()) > 0.02
-    description = both.scene.made[0]
+    description = both.scene.definition[0]
     base = torch.from_numpy(camera_to_world(description)).float()
-    pose = description.rig[1].seen({}, base, torch.zeros(3), description.metres)["camera.to_world"]
+    pose = description.rig[1].make_inputs({}, base, torch.zeros(3), description.metres)["camera.to_world"]
     shift = (pose[:3, 3] - base[:3, 3]) * description.metres
     torch.testing.assert_close(shift, -0.6 * base[:3, 0], atol=1e-5, rtol=0.0)  # 0.6 m to the right: +x is to the left
     torch.testing.assert_close(pose[:3, :3], base[:3, :3], atol=1e-6, rtol=0.0)
@@ -86,10 +86,10 @@ def test_each_camera_takes_the_picture_that_it_takes_alone(tmp_path: Path, kind:
 def test_cameras_around_the_object_are_those_of_as_many_azimuths(tmp_path: Path) -> None:
     ring = advsearch.load_scene("car", "street", camera=rig(tmp_path, RING)).description
     base = torch.from_numpy(camera_to_world(ring)).float()
-    center = torch.from_numpy(middle(ring)).float()
+    center = torch.from_numpy(compute_center(ring)).float()
     for number, mount in enumerate(ring.rig):
         turned = ring.with_values(camera__azimuth=ring.number("camera.azimuth") + 90.0 * number)
-        pose = mount.seen({}, base, center, ring.metres)["camera.to_world"]
+        pose = mount.make_inputs({}, base, center, ring.metres)["camera.to_world"]
         np.testing.assert_allclose(pose.numpy(), camera_to_world(turned), atol=1e-4)
 
 
@@ -180,7 +180,7 @@ def transforms(folder: Path, factor: float, **entries: object) -> str:
     frames = []
     for place, degrees in (([1.0, 2.0, 3.0], 0.0), ([1.3, 2.0, 3.0], 0.0), ([1.6, 2.0, 2.8], 8.0)):
         pose = np.eye(4)
-        pose[:3, :3] = rotation(0.0, degrees, 0.0)
+        pose[:3, :3] = make_rotation(0.0, degrees, 0.0)
         pose[:3, 3] = factor * np.array(place)
         frames.append({"file_path": "a.png", "transform_matrix": pose.tolist()})
     lens = {"camera_model": "OPENCV", "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 16.0, "w": 32, "h": 32}
@@ -208,7 +208,7 @@ def test_frames_of_nerfstudio_are_as_far_apart_as_before_they_were_scaled(
     mounts = read_rig(transforms(tmp_path, scale, **entries))
     np.testing.assert_allclose(mounts[1].pose[:3, 3], [0.3, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(mounts[2].pose[:3, 3], [0.6, 0.0, 0.2], atol=1e-9)
-    assert mounts[0].model is not None and not mounts[0].model.told
+    assert mounts[0].model is not None and not mounts[0].model.reading_notes
 
 
 @pytest.mark.parametrize("scale", [0, -1.0, 1e-9, 1e9, "a", [1.0], True])

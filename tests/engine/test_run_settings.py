@@ -15,11 +15,11 @@ from advsearch.controls import CONTROLS, make_control
 from advsearch.controls.patch import PatchControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, given_to, settings_alone
+from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, make_configured_controls, select_run_settings
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack import python
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.carry_out import load_job
 from advsearch.questions.sweep.settings import SweepConfig
 
 ALL: dict[str, Any] = {"epsilon": 0.07, "norm": "l2", "texture_resolution": 16}
@@ -28,7 +28,7 @@ ALL: dict[str, Any] = {"epsilon": 0.07, "norm": "l2", "texture_resolution": 16}
 def settings(controls: Any, **options: Any) -> dict[str, dict[str, object]]:
     """Settings of the controls of an attack, by the name of the instance."""
     config = AttackConfig(object="mug", controls=controls, **options)
-    return {one.name: one.settings() for one in given_to(config, config.controls)}
+    return {one.name: one.to_settings() for one in make_configured_controls(config, config.controls)}
 
 
 def test_controls_declare_settings_that_a_run_has() -> None:
@@ -70,7 +70,7 @@ def test_an_epsilon_for_one_control_leaves_the_others_their_own() -> None:
 @pytest.mark.parametrize(("norm", "expected"), [(None, "linf"), ("linf", "linf"), ("l2", "l2")])
 def test_a_patch_takes_an_epsilon_in_the_norm_of_the_run(norm: str | None, expected: str) -> None:
     config = AttackConfig(object="mug", controls="patch", epsilon=0.1, norm=norm)
-    (patch,) = given_to(config, config.controls)
+    (patch,) = make_configured_controls(config, config.controls)
     assert (patch.chosen["epsilon"], patch.chosen["norm"]) == (0.1, expected)
     assert PatchControl().chosen["norm"] == "box", "without an epsilon its pixels may go anywhere"
 
@@ -84,7 +84,7 @@ def test_a_patch_takes_an_epsilon_in_the_norm_of_the_run(norm: str | None, expec
 def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(python, "run_attack", lambda parts, *_: parts)
     job: Any = advsearch.attack("mug", controls=controls, **ALL)
-    again = given_to(job.config, job.config.controls)
+    again = make_configured_controls(job.config, job.config.controls)
     texture: Any
     for texture in (job.controls[0], again[0]):
         assert {"epsilon": 0.07, "norm": "l2", "resolution": 16}.items() <= texture.settings().items()
@@ -99,7 +99,7 @@ def test_what_varies_by_chance_takes_all_but_the_budget(monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("asked", ["texture", "texture:object", {"label": {"kind": "texture"}}])
 def test_a_sweep_and_a_render_give_every_texture_its_resolution(asked: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    job = job_of(SweepConfig(object="mug", controls=asked, texture_resolution=16))
+    job = load_job(SweepConfig(object="mug", controls=asked, texture_resolution=16))
     assert [one.chosen["resolution"] for one in job.controls if isinstance(one, TextureControl)] == [16]
 
     def rendered(scene: Any, model: Any, *, controls: Any, **more: Any) -> None:
@@ -115,8 +115,8 @@ def test_a_control_alone_gets_what_it_takes() -> None:
     config = AttackConfig(object="mug", controls="texture,pose,geometry", **ALL)
     seen: list[Any] = []
     for control, settings_of_control in config.controls.items():
-        changes = settings_alone(config, control, settings_of_control)
-        alone = AttackConfig.of(config, controls={control: settings_of_control}, **changes)
+        changes = select_run_settings(config, control, settings_of_control)
+        alone = AttackConfig.from_config(config, controls={control: settings_of_control}, **changes)
         check_run_settings(alone)
         seen.append((alone.epsilon, alone.norm, alone.texture_resolution))
     assert seen == [(0.07, "l2", 16), (None, None, None), (0.07, None, None)]
@@ -182,8 +182,8 @@ def test_an_environment_takes_an_epsilon_for_its_harmonics(controls: Any) -> Non
     named = controls if isinstance(controls, dict) else {name: {} for name in controls}
     config = AttackConfig(object="mug", controls=named, epsilon=0.07)
     check_run_settings(config)
-    (control,) = given_to(config, named)
-    assert control.settings()["epsilon"] == 0.07
+    (control,) = make_configured_controls(config, named)
+    assert control.to_settings()["epsilon"] == 0.07
 
 
 def test_an_environment_without_harmonics_refuses_an_epsilon_of_its_own() -> None:
@@ -195,8 +195,8 @@ def test_an_environment_without_harmonics_refuses_an_epsilon_of_its_own() -> Non
 def test_a_patch_takes_an_epsilon_for_searched_pixels(controls: Any) -> None:
     config = AttackConfig(object="mug", controls=controls, epsilon=0.07)
     check_run_settings(config)
-    (control,) = given_to(config, config.controls)
-    assert control.settings()["epsilon"] == 0.07
+    (control,) = make_configured_controls(config, config.controls)
+    assert control.to_settings()["epsilon"] == 0.07
 
 
 def test_an_epsilon_that_another_control_takes_leaves_a_fixed_patch() -> None:
@@ -204,15 +204,15 @@ def test_an_epsilon_that_another_control_takes_leaves_a_fixed_patch() -> None:
         object="mug", controls={"texture": {}, "patch": {"pixels": 0.5, "size": [0.1, 0.3]}}, epsilon=0.07
     )
     check_run_settings(config)
-    texture, patch = given_to(config, config.controls)
-    assert texture.settings()["epsilon"] == 0.07 and "epsilon" not in patch.settings()
+    texture, patch = make_configured_controls(config, config.controls)
+    assert texture.to_settings()["epsilon"] == 0.07 and "epsilon" not in patch.to_settings()
 
 
 def test_an_epsilon_that_another_control_takes_leaves_an_environment_as_it_is() -> None:
     config = AttackConfig(object="mug", controls="texture,environment", epsilon=0.07)
     check_run_settings(config)
-    texture, environment = given_to(config, "texture,environment")
-    assert texture.settings()["epsilon"] == 0.07 and "epsilon" not in environment.settings()
+    texture, environment = make_configured_controls(config, "texture,environment")
+    assert texture.to_settings()["epsilon"] == 0.07 and "epsilon" not in environment.to_settings()
 
 
 def test_an_epsilon_for_a_control_that_is_not_there_is_refused() -> None:
@@ -228,8 +228,8 @@ def test_an_epsilon_for_a_control_that_is_not_there_is_refused() -> None:
 def test_an_instance_says_its_own(setting: str) -> None:
     config = AttackConfig(object="mug", **{setting: ALL[setting]})
     with pytest.raises(InputError, match=rf"{setting}: control texture was given as an instance; set it there"):
-        given_to(config, [PoseControl(), TextureControl()])
-    assert given_to(config, [PoseControl()])[0].name == "pose"
+        make_configured_controls(config, [PoseControl(), TextureControl()])
+    assert make_configured_controls(config, [PoseControl()])[0].name == "pose"
 
 
 @pytest.mark.parametrize("given", [{"estimators": {"*": "secant"}}, {"measure": "full"}])

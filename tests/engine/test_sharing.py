@@ -13,7 +13,7 @@ import torch
 
 from advsearch.attacks import Query
 from advsearch.cluster import InProcess
-from advsearch.engine.journal import Journal, Shared, lost, worker_call
+from advsearch.engine.journal import Journal, ParallelEvaluator, make_lost_evaluation, make_worker_call
 from advsearch.errors import ClusterError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
@@ -29,11 +29,15 @@ def test_answers_come_in_the_order_of_the_queries_whoever_gives_them() -> None:
     here, there = StandInProblem(), StandInProblem()
     here.prepared, here.renderer = None, RendererCount()  # type: ignore[attr-defined]
     problem: Any = here
-    workers: Any = StandInWorkers(InProcess(worker_call(lambda name: there)))
-    alone, shared = (list(Shared(problem, executor)(queries(5))) for executor in (None, workers))
-    assert [one.said for one in alone] == [one.said for one in shared] and len(workers.given) == 5
+    workers: Any = StandInWorkers(InProcess(make_worker_call(lambda name: there)))
+    alone, shared = (list(ParallelEvaluator(problem, executor)(queries(5))) for executor in (None, workers))
+    assert [one.required_judgement for one in alone] == [one.required_judgement for one in shared] and len(
+        workers.given
+    ) == 5
     assert [one.machine for one in shared] == [*["ab12"] * 4, None], "the last was answered first"
-    assert len(list(Shared(problem, workers)(queries(1)))) == 1 and len(workers.given) == 5, "one alone is done here"
+    assert len(list(ParallelEvaluator(problem, workers)(queries(1)))) == 1 and len(workers.given) == 5, (
+        "one alone is done here"
+    )
 
 
 class RendererCount:
@@ -44,11 +48,11 @@ class RendererCount:
 
 def test_what_nobody_could_answer_says_so_or_ends_the_run() -> None:
     (query,) = queries(1)
-    answer = lost(query, "they died")
-    assert answer.lost and not answer.success and answer.said.payload == {"lost": "they died"}
+    answer = make_lost_evaluation(query, "they died")
+    assert answer.is_lost and not answer.success and answer.required_judgement.payload == {"lost": "they died"}
     for wanted in ("picture", "light"):
         with pytest.raises(ClusterError, match="they died; `advsearch resume RUN workers=null`"):
-            lost(Query(query.u, 0, wanted=wanted), "they died")
+            make_lost_evaluation(Query(query.u, 0, product=wanted), "they died")
 
 
 def test_what_is_in_the_journal_is_not_asked_again(tmp_path: Path) -> None:
@@ -61,10 +65,12 @@ def test_what_is_in_the_journal_is_not_asked_again(tmp_path: Path) -> None:
             yield problem.evaluate(one)
 
     with RunDirectory.create(tmp_path / "run") as run:
-        first = list(Journal(run, Shared(problem)).evaluate_all(queries(3), evaluate))
-        journal = Journal(run, Shared(problem))
+        first = list(Journal(run, ParallelEvaluator(problem)).evaluate_all(queries(3), evaluate))
+        journal = Journal(run, ParallelEvaluator(problem))
         again = list(journal.evaluate_all(queries(5), evaluate))
-        assert asked == [0, 1, 2, 3, 4] and [one.said for one in again[:3]] == [one.said for one in first]
+        assert asked == [0, 1, 2, 3, 4] and [one.required_judgement for one in again[:3]] == [
+            one.required_judgement for one in first
+        ]
         stopped = journal.evaluate_all(queries(8), evaluate)
         for _ in range(6):
             next(stopped)
@@ -76,7 +82,7 @@ def test_reading_back_takes_none_of_the_time(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr("time.perf_counter", lambda: now)
     with RunDirectory.create(tmp_path / "run") as run:
         run.record(*(Row("search", step, seconds=1.0, phase="search") for step in range(3)), told=Told(2, b"", 0, 1))
-        late = Journal(run, Shared(StandInProblem())).clock("search", 3.5)  # type: ignore[arg-type]
+        late = Journal(run, ParallelEvaluator(StandInProblem())).make_time_check("search", 3.5)  # type: ignore[arg-type]
         assert late is not None and not late(1)
         now += 0.4
         assert not late(2) and not late(3), "half a second is left after what was read back"

@@ -18,10 +18,10 @@ from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.questions.sweep import surface
 from advsearch.questions.sweep.summary import SurfaceTable, SweepSummary
-from advsearch.questions.sweep.surface import LEAST, SurfaceCounts
+from advsearch.questions.sweep.surface import MIN_IMAGES, SurfaceCounts
 from advsearch.runs import store
 from advsearch.scene import library
-from advsearch.scene.surface_parts import CELLS
+from advsearch.scene.surface_parts import MAP_SIZE
 from advsearch.tasks import make_task
 
 SIDE = 48
@@ -105,15 +105,17 @@ def is_the_patch(table: SurfaceTable, run: Path) -> None:
     """Check that a map lights up the patch, and nothing far from it."""
     first = table.strongest[0]
     assert abs(first.u - 0.38) < 0.08 and first.v < 0.4 and first.p <= 0.02  # what is above it is seen with it
-    assert first.seen.accuracy is not None and first.seen.accuracy < 0.2 and first.hidden.correct > LEAST
+    assert first.seen.accuracy is not None and first.seen.accuracy < 0.2 and first.hidden.correct > MIN_IMAGES
     assert first.interval[0] < first.difference <= first.interval[1] and first.interval[0] > 0.3
     found = counts_of(run)
-    row, column = np.divmod(np.arange(CELLS**2), CELLS)
-    middle = inside((column + 0.5) / CELLS, 1 - (row + 0.5) / CELLS, 0.01)
-    p, difference = (found[f"{name}_0"][0, : CELLS**2] for name in ("p", "difference"))
+    row, column = np.divmod(np.arange(MAP_SIZE**2), MAP_SIZE)
+    middle = inside((column + 0.5) / MAP_SIZE, 1 - (row + 0.5) / MAP_SIZE, 0.01)
+    p, difference = (found[f"{name}_0"][0, : MAP_SIZE**2] for name in ("p", "difference"))
     assert middle.sum() > 20 and (p[middle] <= 0.05).mean() > 0.9 and difference[middle].min() > 0.5
-    worse = ((p <= 0.05) & (difference > 0)).reshape(CELLS, CELLS).sum(axis=0)
-    assert worse.sum() == table.worse and worse[round(0.28 * CELLS) : round(0.52 * CELLS)].sum() > 0.9 * table.worse
+    worse = ((p <= 0.05) & (difference > 0)).reshape(MAP_SIZE, MAP_SIZE).sum(axis=0)
+    assert (
+        worse.sum() == table.worse and worse[round(0.28 * MAP_SIZE) : round(0.52 * MAP_SIZE)].sum() > 0.9 * table.worse
+    )
 
 
 @pytest.mark.medium

@@ -17,7 +17,7 @@ from advsearch.attacks.evaluation import Query
 from advsearch.engine import acceptance, surface_light
 from advsearch.engine.acceptance import ComparedView, Deviation
 from advsearch.engine.surface_light import SurfaceLight
-from advsearch.questions.attack.carry_out import parts_of, problem_of_parts
+from advsearch.questions.attack.carry_out import load_parts, make_problem_with_warnings
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
@@ -43,7 +43,7 @@ SMALL: dict[str, Any] = {
 def coarse() -> Iterator[None]:
     """Few texels, rays and lights, and a comparison every six evaluations."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(texels, "GROUND", 32)
+        patched.setattr(texels, "GROUND_TEXELS", 32)
         for name, value in {"SIDE": 48, "GATHERED": 64}.items():
             patched.setattr(arrangement, name, value)
         for name, count in {"LIGHTS": 3, "EVERY": 6}.items():
@@ -67,7 +67,7 @@ def off(monkeypatch: pytest.MonkeyPatch, *levels: float) -> None:
 
     def found(self: SurfaceLight, *arguments: Any) -> Deviation:
         compare(self, *arguments)
-        self.deviations[-1] = replace(self.deviations[-1], levels=next(coming), most=3.0)
+        self.deviations[-1] = replace(self.deviations[-1], levels=next(coming), allowed_levels=3.0)
         return self.deviations[-1]
 
     monkeypatch.setattr(SurfaceLight, "_compare", found)
@@ -127,7 +127,7 @@ def test_a_search_for_a_viewpoint_is_predicted_and_its_ranking_is_traced(viewpoi
     told, renders = viewpoints[1].summary.transport, viewpoints[1].summary.renders
     assert told is not None and (told.way, told.reason, told.conditions) == ("surface light", None, None)
     assert (renders["products"], renders["baseline"]) == (80, 8)
-    assert renders["search"] == 8 + 4 * acceptance.FIRST * 3
+    assert renders["search"] == 8 + 4 * acceptance.N_FIRST_VIEWS * 3
     with Store(viewpoints[0] / STORE, read_only=True) as store:
         spp = {(row.phase, row.spp, row.renders) for kind in ("search", "baseline") for row in store.rows(kind)}
     assert spp == {("search", None, 0), ("ranking", 8, 1)}
@@ -169,9 +169,9 @@ def test_a_viewpoint_is_rendered_once_predictions_are_too_far_off(monkeypatch: p
 )
 def test_a_search_for_a_viewpoint_that_renders_says_why(settings: dict[str, Any], reason: str) -> None:
     """In words; nothing is measured."""
-    parts = parts_of(AttackConfig(object="mug", **{**CAMERA, **settings}))
-    problem, _ = problem_of_parts(parts)
-    against = surface_light.refusal_of_surface_light(
+    parts = load_parts(AttackConfig(object="mug", **{**CAMERA, **settings}))
+    problem, _ = make_problem_with_warnings(parts)
+    against = surface_light.find_surface_light_refusal(
         problem, problem.steps, make_policy(str(settings.get("policy", "auto"))), True
     )
     assert reason in str(against)
@@ -188,25 +188,27 @@ def test_a_texture_and_its_viewpoint_are_searched_together() -> None:
 def test_a_camera_that_was_drawn_is_no_progress_of_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the search has moved is the texture: before it that is nothing, whatever the camera."""
     controls = {"texture": {"resolution": 8}, "camera": {}}
-    problem, _ = problem_of_parts(parts_of(AttackConfig(object="mug", **CAMERA | {"controls": controls})))
+    problem, _ = make_problem_with_warnings(load_parts(AttackConfig(object="mug", **CAMERA | {"controls": controls})))
     before: list[Tensor | None] = []
 
     def view_of(*given: Any) -> ComparedView:
         before.append(given[-1])
         return ComparedView(8.0, 9.0, 0.0, 3)
 
-    monkeypatch.setattr("advsearch.engine.problem.view_of", view_of)
+    monkeypatch.setattr("advsearch.engine.problem.compare_with_traced", view_of)
     light = SurfaceLight(problem, 40)
     light.prepare()
-    assert before == [None] * acceptance.FIRST
+    assert before == [None] * acceptance.N_FIRST_VIEWS
     light._compare(problem.domain.sample(torch.Generator().manual_seed(0), 1)[0], 6)
-    assert len(before) == 2 * acceptance.FIRST and all(one is not None for one in before[acceptance.FIRST :])
+    assert len(before) == 2 * acceptance.N_FIRST_VIEWS and all(
+        one is not None for one in before[acceptance.N_FIRST_VIEWS :]
+    )
 
 
 @pytest.mark.medium
 def test_a_random_search_looks_through_the_same_cameras_again() -> None:
     """Every fourth time, where a search that learns sees new ones and other exposures each time."""
-    problem, _ = problem_of_parts(parts_of(AttackConfig(object="mug", **SMALL)))
+    problem, _ = make_problem_with_warnings(load_parts(AttackConfig(object="mug", **SMALL)))
     light, u = SurfaceLight(problem, 18), problem.domain.start
 
     def objective(kind: str, number: int) -> float:
@@ -216,5 +218,7 @@ def test_a_random_search_looks_through_the_same_cameras_again() -> None:
     assert objective("baseline", 1) == objective("baseline", 5) != objective("baseline", 2)
     assert len({objective("search", number) for number in (1, 5, 9)}) == 3
     exposures = [group.coordinates for group in problem.space.groups if group.name == "environment.exposure"]
-    seen = {float(one[exposures[0].start - len(u)]) for n in range(9) for one in light._choose_conditions("search", n, 2)}
-    assert len(seen) == 18 and len(light.renderer.lights_kept) <= 4
+    seen = {
+        float(one[exposures[0].start - len(u)]) for n in range(9) for one in light._choose_conditions("search", n, 2)
+    }
+    assert len(seen) == 18 and len(light.renderer.stored_lights) <= 4

@@ -26,19 +26,19 @@ from torch import Tensor, nn
 
 import advsearch
 import small_models
-from advsearch.attacks.domain import NET, Draws, Product, Seeds, batches
+from advsearch.attacks.domain import NET, ProductIndex, SampleSequence, SeedSequence, split_into_batches
 from advsearch.cli.flags import help_text, with_flags
 from advsearch.cli.main import ExperimentCommand, main
 from advsearch.cli.output import shown_text as text_of
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
-from advsearch.engine.judging import domain_of
+from advsearch.engine.judging import make_domain
 from advsearch.errors import AdvsearchError, InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep import job as swept_scene
-from advsearch.questions.sweep.axes import Points, axis_values, on_grid, parts_of_ranges, read_axes
-from advsearch.questions.sweep.carry_out import _places, job_of, sweep_from_config
+from advsearch.questions.sweep.axes import Points, add_grid_axes, choose_n_parts, parse_axes, parse_axis_values
+from advsearch.questions.sweep.carry_out import load_job, load_scenes, sweep_from_config
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
@@ -164,7 +164,7 @@ GRID = {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]}
 @examples(max_examples=200, deadline=None)
 @given(sizes=st.lists(st.integers(1, 10**6), max_size=6).map(tuple), data=st.data())
 def test_digits_and_numbers_are_inverse(sizes: tuple[int, ...], data: st.DataObject) -> None:
-    product = Product(sizes)
+    product = ProductIndex(sizes)
     assert product.count == math.prod(sizes)
     index = data.draw(st.integers(0, product.count - 1))
     digits = product.digits(index)
@@ -173,19 +173,19 @@ def test_digits_and_numbers_are_inverse(sizes: tuple[int, ...], data: st.DataObj
 
 
 def test_the_last_axis_runs_fastest() -> None:
-    assert [Product((2, 3)).digits(n) for n in range(6)] == list(itertools.product(range(2), range(3)))
-    assert Product(()).count == 1 and Product(()).digits(0) == ()
+    assert [ProductIndex((2, 3)).digits(n) for n in range(6)] == list(itertools.product(range(2), range(3)))
+    assert ProductIndex(()).count == 1 and ProductIndex(()).digits(0) == ()
     with pytest.raises(IndexError, match="expected a point from 0 to 5, got 6"):
-        Product((2, 3)).digits(6)
+        ProductIndex((2, 3)).digits(6)
     with pytest.raises(InputError, match="expected at least one value on each"):
-        Product((2, 0))
+        ProductIndex((2, 0))
 
 
 @pytest.mark.parametrize("first", [0, 3, 4, 9, 10, 11])
 def test_batches_are_those_of_one_who_started_at_the_beginning(first: int) -> None:
-    whole = [list(part) for part in batches(0, 10, 4)]
+    whole = [list(part) for part in split_into_batches(0, 10, 4)]
     assert whole == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
-    rest = [list(part) for part in batches(first, 10, 4)]
+    rest = [list(part) for part in split_into_batches(first, 10, 4)]
     assert [n for part in rest for n in part] == list(range(first, 10))
     assert all(part in whole for part in rest[1:])
 
@@ -193,16 +193,16 @@ def test_batches_are_those_of_one_who_started_at_the_beginning(first: int) -> No
 @pytest.mark.parametrize("sampler", ["sobol", "random"])
 def test_a_draw_is_the_same_from_wherever_it_is_asked(sampler: str) -> None:
     numbers = [0, 1, 100, NET - 1, NET, NET + 5, 3 * NET + 7, 10**12]
-    whole = Draws(3, sampler, 7).points(0, NET + 10)
+    whole = SampleSequence(3, sampler, 7).points(0, NET + 10)
     assert whole.shape == (NET + 10, 3) and 0.0 <= whole.min() and whole.max() < 1.0
-    ahead = {n: Draws(3, sampler, 7).points(n, 1)[0] for n in numbers}
-    back = Draws(3, sampler, 7)
+    ahead = {n: SampleSequence(3, sampler, 7).points(n, 1)[0] for n in numbers}
+    back = SampleSequence(3, sampler, 7)
     for number in reversed(numbers):
         np.testing.assert_array_equal(back.points(number, 1)[0], ahead[number])
         if number < len(whole):
             np.testing.assert_array_equal(whole[number], ahead[number])
-    assert not np.array_equal(Draws(3, sampler, 8).points(0, 4), whole[:4])
-    np.testing.assert_array_equal(Draws(3, sampler, 7).points(NET - 5, 10), whole[NET - 5 : NET + 5])
+    assert not np.array_equal(SampleSequence(3, sampler, 8).points(0, 4), whole[:4])
+    np.testing.assert_array_equal(SampleSequence(3, sampler, 7).points(NET - 5, 10), whole[NET - 5 : NET + 5])
 
 
 def test_sobol_points_fill_the_cube_better_than_random_ones() -> None:
@@ -210,7 +210,10 @@ def test_sobol_points_fill_the_cube_better_than_random_ones() -> None:
     exact = (1.0 - math.cos(1.0)) ** 2
     error = {
         sampler: np.mean(
-            [abs(np.sin(Draws(2, sampler, seed).points(0, 1024)).prod(axis=1).mean() - exact) for seed in range(20)]
+            [
+                abs(np.sin(SampleSequence(2, sampler, seed).points(0, 1024)).prod(axis=1).mean() - exact)
+                for seed in range(20)
+            ]
         )
         for sampler in ("sobol", "random")
     }
@@ -219,17 +222,17 @@ def test_sobol_points_fill_the_cube_better_than_random_ones() -> None:
 
 def test_draws_say_what_is_wrong() -> None:
     with pytest.raises(InputError, match="sampler: expected one of sobol, random, got 'halton'"):
-        Draws(2, "halton", 0)
+        SampleSequence(2, "halton", 0)
     with pytest.raises(InputError, match="`sampler` sobol: expected at most 21201 numbers to draw, got 30000"):
-        Draws(30_000, "sobol", 0)
-    assert Draws(0, "sobol", 0).points(5, 3).shape == (3, 0)
+        SampleSequence(30_000, "sobol", 0)
+    assert SampleSequence(0, "sobol", 0).points(5, 3).shape == (3, 0)
 
 
 def test_every_configuration_has_a_seed_of_its_own() -> None:
-    seeds = Seeds(3, "sweep")
+    seeds = SeedSequence(3, "sweep")
     first = [seeds(index) for index in range(3000)]
-    assert [Seeds(3, "sweep")(index) for index in (2999, 0, 1024)] == [first[2999], first[0], first[1024]]
-    assert len(set(first)) == 3000 and [Seeds(4, "sweep")(index) for index in range(10)] != first[:10]
+    assert [SeedSequence(3, "sweep")(index) for index in (2999, 0, 1024)] == [first[2999], first[0], first[1024]]
+    assert len(set(first)) == 3000 and [SeedSequence(4, "sweep")(index) for index in range(10)] != first[:10]
 
 
 # ---- axes -----------------------------------------------------------------------------------------------------------
@@ -249,7 +252,7 @@ def test_every_configuration_has_a_seed_of_its_own() -> None:
     ],
 )
 def test_values_of_an_axis(parameter: Parameter, given: Any, values: list[float]) -> None:
-    assert list(axis_values("--grid x", parameter, given)) == values
+    assert list(parse_axis_values("--grid x", parameter, given)) == values
 
 
 WRONG_AXES = {
@@ -272,7 +275,7 @@ WRONG_AXES = {
 @pytest.mark.parametrize(("text", "message"), WRONG_AXES.items())
 def test_a_wrong_range_says_what_to_do(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        read_axes({"pose.yaw": text}, ())
+        parse_axes({"pose.yaw": text}, ())
 
 
 @pytest.mark.parametrize(
@@ -289,7 +292,7 @@ def test_a_wrong_range_says_what_to_do(text: str, message: str) -> None:
 )
 def test_a_wrong_list_says_what_to_do(values: list[Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        read_axes({"pose.yaw": values}, ())
+        parse_axes({"pose.yaw": values}, ())
 
 
 @pytest.mark.parametrize(
@@ -307,23 +310,23 @@ def test_a_wrong_list_says_what_to_do(values: list[Any], message: str) -> None:
 )
 def test_a_wrong_name_of_an_axis_says_what_to_do(name: str, error: type[InputError], message: str) -> None:
     with pytest.raises(error, match=message):
-        read_axes({name: [1, 2]}, ())
+        parse_axes({name: [1, 2]}, ())
 
 
 def test_a_parameter_cannot_be_asked_for_twice() -> None:
     drawn = (make_control("pose", {"yaw": [0, 90]}),)
     with pytest.raises(InputError, match=r"`grid` pose.yaw: `controls` pose sets yaw too; leave it out of one"):
-        read_axes({"pose.yaw": [0, 1, 2]}, drawn)
+        parse_axes({"pose.yaw": [0, 1, 2]}, drawn)
     with pytest.raises(InputError, match=r"`grid` light.power:key: key.power is given twice"):
-        read_axes({"light:key.power": [1, 2], "light.power:key": [3, 4]}, ())
-    assert [axis.name for axis in read_axes({"pose.pitch": [0, 1]}, drawn)] == ["pose.pitch"]
+        parse_axes({"light:key.power": [1, 2], "light.power:key": [3, 4]}, ())
+    assert [axis.name for axis in parse_axes({"pose.pitch": [0, 1]}, drawn)] == ["pose.pitch"]
 
 
 def test_names_are_values_too() -> None:
-    (axis,) = read_axes({"environment.which": ["kitchen", "noon"]}, ())
+    (axis,) = parse_axes({"environment.which": ["kitchen", "noon"]}, ())
     assert axis.values == ("kitchen", "noon") and axis.unit == "name"
     with pytest.raises(UnknownNameError, match=r"unknown `grid` environment.which 'kitchn'. Did you mean 'kitchen'"):
-        read_axes({"environment.which": ["kitchn"]}, ())
+        parse_axes({"environment.which": ["kitchn"]}, ())
 
 
 # ---- from numbers to configurations ---------------------------------------------------------------------------------
@@ -335,20 +338,20 @@ def scene() -> advsearch.Scene:
 
 
 def points_of(scene: advsearch.Scene, grid: dict[str, Any], drawn: tuple[Any, ...] = (), samples: int = 1) -> Points:
-    axes = read_axes(grid, drawn)
-    space = make_space(on_grid(drawn, axes, scene.description), scene.description)
-    return Points(space, domain_of(space.controls), axes, samples, "sobol", 0)
+    axes = parse_axes(grid, drawn)
+    space = make_space(add_grid_axes(drawn, axes, scene.description), scene.description)
+    return Points(space, make_domain(space.controls), axes, samples, "sobol", 0)
 
 
 def test_what_is_rendered_is_what_was_listed(scene: advsearch.Scene) -> None:
     grid = {"pose.yaw": "0:360:24", "camera.elevation": [10, 12.3, 50], "environment.which": ["noon", "own", "kitchen"]}
-    axes = read_axes(grid, ())
+    axes = parse_axes(grid, ())
     points = points_of(scene, grid)
-    space = make_space(on_grid((), axes, scene.description), scene.description)
+    space = make_space(add_grid_axes((), axes, scene.description), scene.description)
     assert points.count == 24 * 3 * 3
-    u = points.configurations(0, points.count)
+    u = points.make_configurations(0, points.count)
     listed = list(itertools.product(*(axis.values for axis in axes)))
-    for one, wanted, said in zip(u, listed, points.values(u, 0), strict=True):
+    for one, wanted, said in zip(u, listed, points.describe_images(u, 0), strict=True):
         shown = space.describe(one)
         assert list(said) == ["pose.yaw", "camera.elevation", "environment.which"]
         for axis, value in zip(axes, wanted, strict=True):
@@ -361,19 +364,19 @@ def test_what_is_rendered_is_what_was_listed(scene: advsearch.Scene) -> None:
 def test_a_long_axis_is_exact(scene: advsearch.Scene) -> None:
     points = points_of(scene, {"camera.elevation": "-80:80:99991"})
     space = make_space(
-        on_grid((), read_axes({"camera.elevation": "-80:80:99991"}, ()), scene.description), scene.description
+        add_grid_axes((), parse_axes({"camera.elevation": "-80:80:99991"}, ()), scene.description), scene.description
     )
     for number in (0, 1, 33_333, 77_777, 99_990):
-        u = points.configurations(number, 1)
-        said = points.values(u, number)[0]["camera.elevation"]["value"]
+        u = points.make_configurations(number, 1)
+        said = points.describe_images(u, number)[0]["camera.elevation"]["value"]
         assert space.describe(u[0])["camera.elevation"]["value"] == float(np.float32(said))
 
 
 def test_what_is_not_in_the_grid_stays_or_is_drawn(scene: advsearch.Scene) -> None:
     alone = points_of(scene, {"pose.yaw": [0, 90]})
-    assert [one.shape for one in alone.configurations(0, 2)] == [(1,), (1,)]
+    assert [one.shape for one in alone.make_configurations(0, 2)] == [(1,), (1,)]
     drawn = points_of(scene, {"pose.yaw": [0, 90]}, (make_control("pose"),), samples=4)
-    said = drawn.values(drawn.configurations(0, 8), 0)
+    said = drawn.describe_images(drawn.make_configurations(0, 8), 0)
     assert set(said[0]) == {f"pose.{name}" for name in ("yaw", "pitch", "roll", "x", "y", "scale")}
     assert [one["pose.yaw"]["value"] for one in said] == [0.0] * 4 + [90.0] * 4
     assert len({one["pose.pitch"]["value"] for one in said}) == 8
@@ -389,8 +392,8 @@ def test_the_fast_way_says_what_the_control_says(scene: advsearch.Scene, control
     drawn = (make_control(control),)
     points = points_of(scene, {}, drawn, samples=16)
     space = make_space(drawn, scene.description)
-    u = points.configurations(3, 10)
-    for one, said in zip(u, points.values(u, 3), strict=True):
+    u = points.make_configurations(3, 10)
+    for one, said in zip(u, points.describe_images(u, 3), strict=True):
         assert said == space.describe(one)
 
 
@@ -454,26 +457,26 @@ def test_draws_stay_in_their_budget_and_cover_it(scene: advsearch.Scene) -> None
     )
     points = points_of(scene, {}, drawn, samples=200)
     space = make_space(drawn, scene.description)
-    domain = domain_of(space.controls)
-    u = points.configurations(0, 200)
+    domain = make_domain(space.controls)
+    u = points.make_configurations(0, 200)
     assert all(domain.contains(one) for one in u)
     texels = (u[:, : 16 * 16 * 3] - space.start[: 16 * 16 * 3]).abs()
     assert 0.09 < float(texels.max()) <= 0.1 + 1e-6
-    values = points.values(u, 0)
+    values = points.describe_images(u, 0)
     scales = [math.log2(float(one["pose.scale"]["value"])) for one in values]
     assert abs(np.mean(scales)) < 0.02 and min(scales) < -0.95 and max(scales) > 0.95
-    assert [one.name for one in points.drawn] == ["pose.yaw", "pose.scale"]
-    assert torch.equal(points.configurations(150, 3), u[150:153])
+    assert [one.name for one in points.sampled_numbers] == ["pose.yaw", "pose.scale"]
+    assert torch.equal(points.make_configurations(150, 3), u[150:153])
 
 
 def test_a_million_million_points_start_at_once(scene: advsearch.Scene) -> None:
     grid = {"pose.yaw": "0:360:10000", "camera.elevation": "5:60:10000", "pose.x": "-0.1:0.1:10000"}
-    axes = read_axes(grid, ())
-    space = make_space(on_grid((), axes, scene.description), scene.description)
+    axes = parse_axes(grid, ())
+    space = make_space(add_grid_axes((), axes, scene.description), scene.description)
     began = time.process_time()
-    points = Points(space, domain_of(space.controls), axes, 1, "sobol", 0)
+    points = Points(space, make_domain(space.controls), axes, 1, "sobol", 0)
     assert points.count == 10**12
-    said = points.values(points.configurations(10**12 - 8, 8), 10**12 - 8)
+    said = points.describe_images(points.make_configurations(10**12 - 8, 8), 10**12 - 8)
     assert time.process_time() - began < 10.0
     assert [round(float(said[-1][name]["value"]), 6) for name in grid] == [359.964, 60.0, 0.1]
 
@@ -492,7 +495,7 @@ def test_ten_million_draws_start_at_once() -> None:
 
 @pytest.mark.parametrize(("pictures", "parts"), [(10, 2), (120, 4), (500, 10), (10_000_000, 10)])
 def test_a_pair_of_parts_has_several_draws(pictures: int, parts: int) -> None:
-    assert parts_of_ranges(pictures) == parts
+    assert choose_n_parts(pictures) == parts
     assert pictures / parts**2 >= 5 or parts == 2
 
 
@@ -542,7 +545,7 @@ def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
     assert summary.interval == clopper_pearson(len(right), len(rows))
     assert summary.answers == {"vase": len(rows) - len(right)}
     by_axis = {(row.axis, str(row.value)): row for row in summary.axes}
-    assert len(by_axis) == len(summary.axes) == 6 + 3 + parts_of_ranges(len(rows))
+    assert len(by_axis) == len(summary.axes) == 6 + 3 + choose_n_parts(len(rows))
     for name in GRID:
         for value in {row.values[name]["value"] for row in rows}:
             mine = [row for row in rows if row.values[name]["value"] == value]
@@ -782,9 +785,9 @@ def test_resume_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_any_configuration_can_be_the_first() -> None:
     config = SweepConfig(object="mug", controls={"pose": {}}, samples=2_000_000, resolution=32, trials=0)
-    sweep = Sweep(job_of(config), None, NullProgress())
+    sweep = Sweep(load_job(config), None, NullProgress())
     FakeRenderer.stops_at = 8
-    late = sweep.carry_out(first=1_999_992)
+    late = sweep.execute(first=1_999_992)
     assert [row.step for row in late.rows()] == list(range(1_999_992, 2_000_000))
 
 
@@ -842,7 +845,7 @@ def test_the_recipe_repeats_the_sweep(tmp_path: Path, monkeypatch: pytest.Monkey
     assert SweepConfig.from_yaml(tmp_path / "run.yaml") == config
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.obj").touch()
-    assert SweepConfig(object="a.obj,mug").to_repeat().object == f"{tmp_path / 'a.obj'},mug"
+    assert SweepConfig(object="a.obj,mug").make_repeatable().object == f"{tmp_path / 'a.obj'},mug"
 
 
 def command(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
@@ -942,8 +945,8 @@ def test_every_example_of_the_documentation_is_a_sweep(
     asked: list[SweepConfig] = []
     monkeypatch.setattr(ExperimentCommand, "run_config", lambda self, config, **rest: kept(asked, config, 0))
     assert main(words[1:]) == 0
-    job = job_of(asked[0])
-    assert Sweep(job, None, NullProgress()).total > 1
+    job = load_job(asked[0])
+    assert Sweep(job, None, NullProgress()).n_rows > 1
 
 
 def test_every_flag_of_its_own_is_documented() -> None:
@@ -1201,5 +1204,5 @@ def test_rows_are_the_same_with_and_without_changed_pictures_really_rendered() -
 def test_a_sweep_of_settings_shows_the_scene_that_python_passed() -> None:
     scene = advsearch.load_scene("mug")
     config = SweepConfig(object="mug", environment="studio", controls={"pose": {}}, samples=2)
-    (place,) = _places(config.with_python_objects({("scene", "mug"): scene}))
+    (place,) = load_scenes(config.with_python_objects({("scene", "mug"): scene}))
     assert place.scene is scene and (place.object, place.environment) == ("mug", "studio")

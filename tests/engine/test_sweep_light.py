@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 import advsearch
-from advsearch.attacks.domain import Product
+from advsearch.attacks.domain import ProductIndex
 from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation
 from advsearch.questions.sweep import predicting
 from advsearch.questions.sweep.job import SweptScene
-from advsearch.questions.sweep.predicting import Groups, combined
+from advsearch.questions.sweep.predicting import Groups, combine_transport
 from advsearch.runs.results import LinearTransport, PredictionError
 from stand_ins import rows
 
@@ -31,20 +31,20 @@ def _paying(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_pictures_fall_into_groups_that_differ_in_light_alone() -> None:
     """Of pose x power x camera x tint with two draws each, each group has all of power and tint."""
-    groups = Groups(Product((2, 3, 2, 4)), 2, (False, True, False, True), True)
-    assert (groups.size, groups.count, groups.at_once) == (24, 4, 2)
+    groups = Groups(ProductIndex((2, 3, 2, 4)), 2, (False, True, False, True), True)
+    assert (groups.group_size, groups.n_groups, groups.n_cached_groups) == (24, 4, 2)
     found: dict[int, list[int]] = {}
     for number in range(groups.grid.count * 2):
-        found.setdefault(groups.group(number), []).append(number)
+        found.setdefault(groups.find_group(number), []).append(number)
     assert sorted(found) == [0, 1, 2, 3]
     for members in found.values():
-        assert [groups.member(members[-1], place) for place in range(groups.size)] == members
+        assert [groups.find_member(members[-1], place) for place in range(groups.group_size)] == members
 
 
 def test_light_as_the_last_axes_needs_one_group_at_a_time() -> None:
-    assert Groups(Product((5, 3)), 1, (False, True), True).at_once == 1
-    assert Groups(Product((5, 3)), 2, (True, True), True).count == 1
-    assert Groups(Product((5, 3)), 2, (False, True), False).size == 1
+    assert Groups(ProductIndex((5, 3)), 1, (False, True), True).n_cached_groups == 1
+    assert Groups(ProductIndex((5, 3)), 2, (True, True), True).n_groups == 1
+    assert Groups(ProductIndex((5, 3)), 2, (False, True), False).group_size == 1
 
 
 @pytest.mark.medium
@@ -92,7 +92,7 @@ def test_each_pose_has_basis_pictures_of_its_own_and_a_sweep_that_was_stopped_en
 
 @pytest.mark.medium
 def test_a_group_whose_prediction_is_off_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(predicting, "compared", lambda view: Deviation(9.0, 0.0, 2.0, pictures=6))
+    monkeypatch.setattr(predicting, "compare_views", lambda view: Deviation(9.0, 0.0, 2.0, n_traced=6))
     found = advsearch.sweep("mug", "reference", GRID, **SMALL)
     told, renders = found.summary.transport, found.summary.renders
     assert told is not None and "1 of 1 groups were rendered" in str(told.reason)
@@ -131,6 +131,6 @@ def test_of_several_scenes_the_worst_is_told() -> None:
     def one(levels: float, seconds: float) -> LinearTransport:
         return LinearTransport(used=True, bytes=8, seconds=seconds, error=PredictionError(levels=levels, logits=0.0))
 
-    found = combined([one(1.0, 2.0), None, one(3.0, 4.0)])
+    found = combine_transport([one(1.0, 2.0), None, one(3.0, 4.0)])
     assert found is not None and found.error is not None and (found.error.levels, found.seconds) == (3.0, 6.0)
-    assert combined([None]) is None
+    assert combine_transport([None]) is None

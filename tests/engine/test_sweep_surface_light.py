@@ -11,15 +11,15 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.attacks.domain import Product
+from advsearch.attacks.domain import ProductIndex
 from advsearch.cluster import BatchResult, WorkerStats
 from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation
-from advsearch.engine.journal import worker_call
+from advsearch.engine.journal import make_worker_call
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import predicting
-from advsearch.questions.sweep.carry_out import job_of
-from advsearch.questions.sweep.job import OpenScenes, SweptScene
+from advsearch.questions.sweep.carry_out import load_job
+from advsearch.questions.sweep.job import SceneLoader, SweptScene
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.predicting import Groups
 from advsearch.questions.sweep.settings import SweepConfig
@@ -37,7 +37,7 @@ KITCHEN_TOO: dict[str, Any] = {"environment.which": ["studio", "kitchen"], "came
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[SurfaceRenderer]]:
     """Few texels and rays, which pay at once, and are near enough; those that are made."""
-    monkeypatch.setattr(texels, "GROUND", 24)
+    monkeypatch.setattr(texels, "GROUND_TEXELS", 24)
     for name, value in {"SIDE": 32, "GATHERED": 48}.items():
         monkeypatch.setattr(arrangement, name, value)
     monkeypatch.setattr(predicting, "MIN_SAVING_FACTOR", 0.0)
@@ -59,24 +59,24 @@ def swept(**more: Any) -> Any:
 
 def test_all_frames_of_a_drive_are_a_group_and_draws_tell_drives_apart() -> None:
     """Of time x pose with three draws, where cameras do not share what is drawn."""
-    groups = Groups(Product((5, 2)), 3, (True, False), False, frames=0)
-    assert (groups.size, groups.count, groups.at_once) == (5, 6, 6)
+    groups = Groups(ProductIndex((5, 2)), 3, (True, False), False, frames=0)
+    assert (groups.group_size, groups.n_groups, groups.n_cached_groups) == (5, 6, 6)
     found: dict[int, list[int]] = {}
     for number in range(30):
-        found.setdefault(groups.group(number), []).append(number)
+        found.setdefault(groups.find_group(number), []).append(number)
     assert sorted(found) == list(range(6)) and all(len({one % 6 for one in some}) == 1 for some in found.values())
     for members in found.values():
-        assert [groups.member(members[-1], place) for place in range(5)] == members
+        assert [groups.find_member(members[-1], place) for place in range(5)] == members
 
 
 @pytest.mark.medium
 def test_pictures_are_those_that_are_rendered() -> None:
     """Each nearer to its own traced picture than to that of any other row."""
     scene = SweptScene(
-        job_of(SweepConfig(object="mug", **SMALL, grid={"camera.azimuth": "0:360:4", "camera.elevation": [5, 60]})), 0
+        load_job(SweepConfig(object="mug", **SMALL, grid={"camera.azimuth": "0:360:4", "camera.elevation": [5, 60]})), 0
     )
-    queries = [query for _, _, query in scene.job.queries(range(8))]
-    predicted = torch.stack([scene.picture(query) for query in queries])
+    queries = [query for _, _, query in scene.job.make_queries(range(8))]
+    predicted = torch.stack([scene.render_image(query) for query in queries])
     traced = torch.stack([scene.problems[0].picture(query.u, seed=9, spp=64) for query in queries])
     apart = 255.0 * ((predicted[:, None] - traced[None]) ** 2).mean(dim=(2, 3, 4)).sqrt()
     assert apart.argmin(dim=1).tolist() == list(range(8))
@@ -109,13 +109,15 @@ class Two:
     facts = WorkerStats(most=2)
 
     def __init__(self, job: Any) -> None:
-        self.scenes = [OpenScenes(job), OpenScenes(job)]
+        self.scenes = [SceneLoader(job), SceneLoader(job)]
 
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         pieces = list(batches)
         random.Random(1).shuffle(pieces)
         for number, items in enumerate(pieces):
-            yield BatchResult(items, worker_call(self.scenes[number % 2].named)(items), f"worker {number % 2}")
+            yield BatchResult(
+                items, make_worker_call(self.scenes[number % 2].load_by_name)(items), f"worker {number % 2}"
+            )
 
 
 @pytest.mark.medium
@@ -135,9 +137,9 @@ def test_a_sweep_that_was_stopped_and_goes_on_by_workers_has_the_same_rows(
     with monkeypatch.context() as patch:
         patch.setattr(SweptScene, "evaluate_all", stopped)
         assert swept(grid=grid, run=tmp_path / "parts").summary.configurations == 4
-    job = job_of(SweepConfig(object="mug", **SMALL, grid=grid))
+    job = load_job(SweepConfig(object="mug", **SMALL, grid=grid))
     with RunDirectory.resume(tmp_path / "parts") as run:
-        again = Sweep(job, run, NullProgress(), Two(job)).carry_out().summary
+        again = Sweep(job, run, NullProgress(), Two(job)).execute().summary
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole") and again.renders == whole.renders
 
 
@@ -154,7 +156,7 @@ def test_drives_are_predicted_whatever_is_drawn_for_each(coarse: list[SurfaceRen
 @pytest.mark.medium
 def test_a_group_whose_pictures_are_too_far_off_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     levels = iter([9.0, 1.0])
-    monkeypatch.setattr(predicting, "compared", lambda view: Deviation(next(levels), 0.0, 2.0, pictures=6))
+    monkeypatch.setattr(predicting, "compare_views", lambda view: Deviation(next(levels), 0.0, 2.0, n_traced=6))
     found = swept(grid=GRID)
     told = found.summary.transport
     assert told is not None and "1 of 2 groups were rendered" in str(told.reason)

@@ -14,14 +14,14 @@ from test_sweep import FakeRenderer
 import advsearch
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as text_of
-from advsearch.cluster import BatchResult, Call, WorkerStats
-from advsearch.engine.journal import worker_call
-from advsearch.engine.record import LOST
+from advsearch.cluster import BatchFunction, BatchResult, WorkerStats
+from advsearch.engine.journal import make_worker_call
+from advsearch.engine.record import LOST_LABEL
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import job as swept_scene
-from advsearch.questions.sweep.carry_out import job_of
-from advsearch.questions.sweep.job import OpenScenes
+from advsearch.questions.sweep.carry_out import load_job
+from advsearch.questions.sweep.job import SceneLoader
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
@@ -45,7 +45,7 @@ def nothing_is_rendered(request: pytest.FixtureRequest, monkeypatch: pytest.Monk
 class Disorder:
     """Carries out batches in any order, with facts as of two machines."""
 
-    call: Call
+    call: BatchFunction
     seed: int = 0
     lose: int | None = None
     stop: int | None = None
@@ -78,17 +78,17 @@ def summary(result: Any) -> dict[str, Any]:
 
 
 def shared(path: Path, resumed: bool = False, **given: Any) -> Any:
-    job = job_of(CONFIG)
+    job = load_job(CONFIG)
     with RunDirectory.resume(path) if resumed else RunDirectory.create(path) as run:
-        executor = Disorder(worker_call(OpenScenes(job).named), **given)
-        return Sweep(job, run, NullProgress(), executor).carry_out()
+        executor = Disorder(make_worker_call(SceneLoader(job).load_by_name), **given)
+        return Sweep(job, run, NullProgress(), executor).execute()
 
 
 @pytest.mark.medium
 def test_any_order_any_interrupt_and_any_repetition_end_with_the_same_rows(tmp_path: Path) -> None:
-    job = job_of(CONFIG)
+    job = load_job(CONFIG)
     with RunDirectory.create(tmp_path / "alone") as run:
-        alone = Sweep(job, run, NullProgress()).carry_out()
+        alone = Sweep(job, run, NullProgress()).execute()
     assert alone.summary.shared is None and len(rows(tmp_path / "alone")) == 12
     path = tmp_path / "shared"
     first = shared(path, seed=1, stop=3)
@@ -100,14 +100,14 @@ def test_any_order_any_interrupt_and_any_repetition_end_with_the_same_rows(tmp_p
 @pytest.mark.medium
 def test_what_comes_in_any_order_is_counted_as_in_order(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "alone") as run:
-        alone = Sweep(job_of(CONFIG), run, NullProgress()).carry_out()
+        alone = Sweep(load_job(CONFIG), run, NullProgress()).execute()
     assert summary(shared(tmp_path / "shared", seed=3)) == summary(alone)
 
 
 @pytest.mark.medium
 def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path: Path) -> None:
     result = shared(tmp_path / "run", lose=7)
-    (lost,) = [row for row in result.rows() if row.label == LOST]
+    (lost,) = [row for row in result.rows() if row.label == LOST_LABEL]
     assert lost.step == 7 and lost.payload == {"lost": "no answer: 3 workers died of it"}
     assert (lost.correct, lost.margin, lost.probability, lost.renders) == (False, None, None, 0)
     assert lost.values["pose.yaw"]["value"] in (0.0, 120.0, 240.0) and lost.values["environment"]["value"] == "noon"
@@ -124,17 +124,17 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
             for done in super().results(batches):
                 yield replace(done, machine="ab12" if done.items[0][2].number < 4 else None)
 
-    job = job_of(CONFIG)
+    job = load_job(CONFIG)
     facts = WorkerStats(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
     with RunDirectory.create(tmp_path / "run") as run:
-        executor = Two(worker_call(OpenScenes(job).named), facts=facts)
-        result = Sweep(job, run, NullProgress(), executor).carry_out()
+        executor = Two(make_worker_call(SceneLoader(job).load_by_name), facts=facts)
+        result = Sweep(job, run, NullProgress(), executor).execute()
         assert run.store.noted("machines") == {"ab12": {"processor": "another", "LLVM": "19.1"}}
     assert [row.machine for row in result.rows()] == ["ab12"] * 4 + [None] * 8
     told = "not alike, so that their last bits may differ; beside the one that kept the run: processor another, LLVM 19"
     assert any(told in text for text in result.summary.warnings)
     with RunDirectory.resume(tmp_path / "run") as run:
-        assert any(told in text for text in Sweep(job, run, NullProgress()).carry_out().summary.warnings)
+        assert any(told in text for text in Sweep(job, run, NullProgress()).execute().summary.warnings)
 
 
 def test_what_is_shown_says_where_the_time_went() -> None:

@@ -18,7 +18,7 @@ from advsearch.progress import Progress
 from advsearch.questions.sweep.result import import_threedb
 from advsearch.runs.exporters import EXPORTERS, Exported, Exporter
 from advsearch.runs.store import NAME, Row, Store
-from advsearch.viewer.thumbnails import kept_pictures
+from advsearch.viewer.thumbnails import find_thumbnails
 from stored_sweeps import make_sweep
 
 
@@ -116,7 +116,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
         assert (before.correct, before.label, before.margin) == (after.correct, after.label, after.margin)
         assert after.values["pose.yaw"]["value"] == before.values["pose.yaw"]["value"]
         assert after.values["environment"] == before.values["environment"]
-    kept = kept_pictures(again)
+    kept = find_thumbnails(again)
     assert kept is not None
     assert kept.numbers == tuple(range(24))
     assert "Right in 18 of 24" in (again / "report.html").read_text().replace("&nbsp;", " ")
@@ -153,7 +153,7 @@ def test_an_id_leads_nowhere_else(tmp_path: Path) -> None:
     secret = tmp_path / "secret_rgb.png"
     secret.write_bytes(b"no picture")
     run = import_threedb(write(tmp_path / "in", {**LINE, "id": "../../secret"}), tmp_path / "run")
-    assert kept_pictures(run) is None
+    assert find_thumbnails(run) is None
 
 
 @pytest.mark.medium

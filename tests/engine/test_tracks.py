@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.models import ModelWarning
-from advsearch.questions.sweep.tracks import ConstantVelocity, DetectedFrame, overlaps, tracked
+from advsearch.questions.sweep.tracks import ConstantVelocity, DetectedFrame, compute_overlaps, track_drive
 from small_models import SIDE, Finder
 
 Doubles = npt.NDArray[np.float64]
@@ -39,15 +39,15 @@ def drive(scores: Sequence[float], others: Sequence[Doubles] = ()) -> list[Detec
 
 def test_a_track_goes_on_through_frames_that_a_detector_misses() -> None:
     """Lost frames are lost; but its number stays, as the boxes go on as they went, for three frames and no more."""
-    assert tracked(drive([0.9] * 10), ConstantVelocity, 0.5) == (0.0, 0, 0)
-    assert tracked(drive([0.9] * 4 + [0.0] * 3 + [0.9] * 3), ConstantVelocity, 0.5) == (0.3, 0, 3)
-    assert tracked(drive([0.9] * 4 + [0.0] * 4 + [0.9] * 2), ConstantVelocity, 0.5) == (0.4, 1, 4)
-    assert tracked(drive([0.0] * 5), ConstantVelocity, 0.5) == (1.0, 0, 5)
+    assert track_drive(drive([0.9] * 10), ConstantVelocity, 0.5) == (0.0, 0, 0)
+    assert track_drive(drive([0.9] * 4 + [0.0] * 3 + [0.9] * 3), ConstantVelocity, 0.5) == (0.3, 0, 3)
+    assert track_drive(drive([0.9] * 4 + [0.0] * 4 + [0.9] * 2), ConstantVelocity, 0.5) == (0.4, 1, 4)
+    assert track_drive(drive([0.0] * 5), ConstantVelocity, 0.5) == (1.0, 0, 5)
 
 
 def test_unsure_boxes_keep_a_track_and_begin_none() -> None:
-    assert tracked(drive([0.9] * 4 + [0.2] * 4 + [0.9] * 2), ConstantVelocity, 0.5) == (0.0, 0, 0)
-    assert tracked(drive([0.2] * 6), ConstantVelocity, 0.5) == (1.0, 0, 6)
+    assert track_drive(drive([0.9] * 4 + [0.2] * 4 + [0.9] * 2), ConstantVelocity, 0.5) == (0.0, 0, 0)
+    assert track_drive(drive([0.2] * 6), ConstantVelocity, 0.5) == (1.0, 0, 6)
 
 
 def test_two_that_pass_each_other_keep_their_numbers() -> None:
@@ -56,14 +56,14 @@ def test_two_that_pass_each_other_keep_their_numbers() -> None:
         boxes = np.stack([moving(frame), moving(11 - frame) + np.array([0.0, 8.0, 0.0, 8.0])])
         order = [0, 1] if frame % 2 else [1, 0]
         seen = tracker(boxes[order], np.array([0.9, 0.8]))
-        numbers.append(tuple(max(seen, key=lambda one: overlaps(one[1][None], box)[0])[0] for box in boxes))
+        numbers.append(tuple(max(seen, key=lambda one: compute_overlaps(one[1][None], box)[0])[0] for box in boxes))
     assert len(numbers) == 12 and len(set(numbers)) == 1
 
 
 def test_frames_that_do_not_see_the_object_lose_nothing() -> None:
     frames = drive([0.9] * 6)
     frames[2:4] = [frame._replace(true=None, boxes=np.zeros((0, 4)), scores=np.zeros(0)) for frame in frames[2:4]]
-    assert tracked(frames, ConstantVelocity, 0.5) == (0.0, 0, 0)
+    assert track_drive(frames, ConstantVelocity, 0.5) == (0.0, 0, 0)
 
 
 class Replays(nn.Module):

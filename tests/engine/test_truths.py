@@ -43,5 +43,5 @@ def test_a_truth_is_remembered_where_only_base_colours_differ(route: str, asks: 
     problem = object.__new__(Problem)
     vars(problem).update(task=task, space=space, renderer=renderer, facts=partial(Facts, "x", None, None), _truths={})
     asked = [(0.1, 0.5), (0.2, 0.5), (0.1, 0.7), (0.1, 0.7)]
-    found = [problem.truth(torch.tensor(one)) for one in asked]
+    found = [problem.find_truth(torch.tensor(one)) for one in asked]
     assert found == pytest.approx([0.5, 0.5, 0.7, 0.7]) and len(seen) == looked

@@ -20,9 +20,9 @@ def load_object(path: Path) -> None:
 def load_node(path: Path) -> None:
     """Read a glTF scene, with its first node as the object and the rest around it, and render it from every camera."""
     import advsearch
-    from advsearch.scene.importing.scenes import node_names
+    from advsearch.scene.importing.scenes import list_node_names
 
-    names = node_names(path)
+    names = list_node_names(path)
     if names:
         spec = f"{path}#{names[0]}"
         scene = advsearch.load_scene(spec)
@@ -37,9 +37,9 @@ def load_node(path: Path) -> None:
 def load_mitsuba(path: Path) -> None:
     """Read a Mitsuba scene, with its first shape that can be one as the object, and put it into Mitsuba."""
     import advsearch
-    from advsearch.scene.mitsuba_backend.scene_files import contents
+    from advsearch.scene.mitsuba_backend.scene_files import read_contents
 
-    names = contents(path).objects
+    names = read_contents(path).objects
     if names:
         advsearch.load_scene(names[0], scene=path).renderer("pose", resolution=16)
 
@@ -197,7 +197,7 @@ def _page_faults(run: Path, *, compares: bool) -> list[str]:
         reader = Thread(target=lambda own=own, answered=answered: answered.append(own.makefile("rb").read()))
         reader.start()
         own.sendall(f"GET {page} HTTP/1.0\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode())
-        server.clients.serve_one(other, ("127.0.0.1", 0))
+        server.clients.serve_connection(other, ("127.0.0.1", 0))
         reader.join()
         own.close()
         head, _, body = answered[0].partition(b"\r\n\r\n")
@@ -242,12 +242,12 @@ def load_blend(path: Path) -> None:
 
 def load_threedb(path: Path) -> None:
     """Read a folder of 3DB as `import-3db` does."""
-    from advsearch.questions.sweep.result import read_picture
+    from advsearch.questions.sweep.result import read_image
     from advsearch.runs.export import read_threedb
 
     for _, picture in read_threedb(path.parent):
         if picture is not None:
-            read_picture(picture)
+            read_image(picture)
 
 
 def misbehave(path: Path) -> None:

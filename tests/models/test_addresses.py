@@ -24,7 +24,7 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import InputError, ModelError
 from advsearch.models import address
-from advsearch.models.address import AskedModel
+from advsearch.models.address import AddressModel
 from advsearch.tasks import make_task
 from advsearch.trust.code import nothing_allowed
 from advsearch.trust.network import KEY, check_address, is_local
@@ -76,7 +76,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
-    monkeypatch.setattr(address, "FIRST_WAIT", 0.01)
+    monkeypatch.setattr(address, "FIRST_DELAY", 0.01)
     monkeypatch.delenv(KEY, raising=False)
     with Server() as made, serving(made):
         yield made
@@ -125,7 +125,7 @@ def test_the_server_of_the_page_is_the_model_behind_it(monkeypatch: pytest.Monke
     own = names["model"]
     assert model.labels == own.labels and not model.differentiable
     expected = own((images * 255).round() / 255).softmax(dim=1)
-    assert torch.allclose(logits.exp(), expected.clamp_min(address.LEAST), atol=1e-5)
+    assert torch.allclose(logits.exp(), expected.clamp_min(address.MIN_SCORE), atol=1e-5)
 
 
 def test_what_is_sent_is_the_picture_as_rendered_and_the_question(server: Server) -> None:
@@ -230,7 +230,7 @@ def test_nobody_there_a_slow_one_and_one_that_drips(server: Server) -> None:
     server.say = slow
     with pytest.raises(ModelError, match="timed out"):
         ask_of(server, seconds=0.05)
-    assert len(server.came) == address.TRIES
+    assert len(server.came) == address.MAX_TRIES
 
 
 DRIPS = {
@@ -275,7 +275,7 @@ def dripping(begun: bytes, more: bytes) -> Iterator[int]:
 @pytest.mark.parametrize("case", DRIPS)
 def test_an_answer_has_its_time_in_all(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever drips, the model is given up after `seconds`, and no thread goes on waiting."""
-    monkeypatch.setattr(address, "TRIES", 1)
+    monkeypatch.setattr(address, "MAX_TRIES", 1)
     monkeypatch.delenv(KEY, raising=False)
     with dripping(*DRIPS[case]) as port:
         model = advsearch.load_model(f"http://127.0.0.1:{port}", task="answer", ask={"seconds": 0.3})
@@ -508,5 +508,5 @@ def test_the_module_shows_what_it_spends(server: Server) -> None:
     server.say = chat("mug")
     model = advsearch.load_model(server.chat, task="answer", ask={"per_call": 0.5})
     model(torch.zeros((2, 8, 8, 3)))
-    assert isinstance(model.module, AskedModel)
-    assert model.module.sentence == "The model tiny was asked 1 times, 110 tokens, 0.5 of money."
+    assert isinstance(model.module, AddressModel)
+    assert model.module.spending_sentence == "The model tiny was asked 1 times, 110 tokens, 0.5 of money."

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch import load_model
-from advsearch.tasks.depth import DISPARITY, METRIC, Depth, Distances
+from advsearch.tasks.depth import DISPARITY, METRIC, Depth, DepthTruth
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -114,7 +114,7 @@ def test_the_gradient_of_a_network_agrees_with_differences(tmp_path: Path) -> No
     model: Any = load_model(published(tmp_path, "DepthAnything"), task="depth")
     mask = torch.zeros(SIDE, SIDE).bool()
     mask[8:24, 8:24] = True
-    truth = Distances(
+    truth = DepthTruth(
         mask, torch.linspace(2.0, 4.0, SIDE, dtype=torch.float64)[:, None].expand(SIDE, SIDE) - 0.5 * mask
     )
     network, task = model.module.double(), Depth()

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from advsearch.config import SceneConfig
 from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
-from advsearch.models.model import tensors_in
+from advsearch.models.model import list_tensors
 from advsearch.tasks.detection import Detection
 from fuzz import onnx_files
 
@@ -217,7 +217,7 @@ def test_a_head_without_gradient_gets_that_of_its_outputs(function: str) -> None
         leaf = picture.clone().requires_grad_()
         model = load_model(OneToOne(one), input_size=32, labels=["mug"], task=Detection())
         assert model.differentiable and model.attached == bool(one)
-        total = sum(tensor.sum() for tensor in tensors_in(model(leaf)) if tensor.requires_grad)
+        total = sum(tensor.sum() for tensor in list_tensors(model(leaf)) if tensor.requires_grad)
         assert isinstance(total, Tensor)
         (slope,) = torch.autograd.grad(total, leaf)
         slopes.append(slope)

@@ -225,7 +225,7 @@ def test_weights_stay_as_they_are_stored(tmp_path: Path) -> None:
 
 def test_what_a_large_network_takes_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = published(tmp_path, llava())
-    monkeypatch.setattr(language, "LARGE", 1000)
+    monkeypatch.setattr(language, "MIN_LARGE_WEIGHTS", 1000)
     with pytest.warns(ModelWarning, match=r"has 1\.\d+e-05 billion weights, 4\.\d+e-05 GB, and took \S+ s to answer"):
         load_model(spec, labels=NAMES)
 
@@ -282,7 +282,7 @@ def test_weights_larger_than_the_memory_are_refused(tmp_path: Path, monkeypatch:
     spec = published(tmp_path / "net", llava())
     told = tmp_path / "meminfo"
     told.write_text("MemTotal: 99 kB\nMemAvailable: 10 kB\nSwapFree: 2 kB\n")
-    monkeypatch.setattr(own, "MEMORY", told)
+    monkeypatch.setattr(own, "MEMORY_FILE", told)
     with pytest.raises(ModelError, match=r"its weights take 5.*e-05 GB, and 1.23e-05 GB of memory are free"):
         load_model(spec, labels=NAMES)
 

@@ -14,7 +14,7 @@ from torch import nn
 
 from advsearch import load_model
 from advsearch.models import ModelWarning
-from advsearch.tasks.segmentation import Region, Segmentation
+from advsearch.tasks.segmentation import Segmentation, SegmentationTruth
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -119,7 +119,7 @@ def test_the_gradient_agrees_with_differences(tmp_path: Path) -> None:
     """Along a direction, of MaskFormer: the attention of the others has thresholds."""
     model: Any = load_model(published(tmp_path, "MaskFormer"), task="segmentation")
     network = model.module.double()
-    task, truth = Segmentation(labels=NAMES), Region((0,), torch.ones(SIDE, SIDE).bool())
+    task, truth = Segmentation(labels=NAMES), SegmentationTruth((0,), torch.ones(SIDE, SIDE).bool())
     way = torch.randn((1, 3, SIDE, SIDE), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     at = PICTURE.permute(2, 0, 1)[None].double().requires_grad_()
 

@@ -119,7 +119,7 @@ def test_rt_detr_has_its_gradient() -> None:
 
 def _value(model: Model, picture: Tensor) -> Tensor:
     """One number that takes all answers in, in the type of the network."""
-    output = model.ask(model.preprocessing(picture))
+    output = model.run_network(model.preprocessing(picture))
     parts = [output] if isinstance(output, Tensor) else list(output[0].values())
     values = torch.cat([one.flatten().double() for one in parts])
     return (values * torch.linspace(-1.0, 1.0, len(values), dtype=values.dtype)).sum()

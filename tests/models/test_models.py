@@ -32,7 +32,7 @@ from advsearch.models import (
     read_labels,
     reference,
 )
-from advsearch.models.labels import LabelsOrigin, fitting_labels, sets_of
+from advsearch.models.labels import LabelsOrigin, fit_labels, list_sets_of_size
 from advsearch.tasks import make_task
 
 DATA = conftest.DATA / "models"
@@ -746,13 +746,13 @@ def test_unknown_names() -> None:
 
 def test_a_count_of_labels_that_is_that_of_a_data_set_names_it() -> None:
     for count, name in ((90, "coco90"), (91, "coco91"), (21, "voc")):
-        assert sets_of(count) == [name]
+        assert list_sets_of_size(count) == [name]
         with pytest.raises(InputError, match=rf"labels: 80 labels, .* in index order \(`labels={name}` has {count}\)$"):
-            fitting_labels(count, read_labels("coco"), LabelsOrigin(), "net")
-        unnamed = fitting_labels(count, None, LabelsOrigin(), "net")
+            fit_labels(count, read_labels("coco"), LabelsOrigin(), "net")
+        unnamed = fit_labels(count, None, LabelsOrigin(), "net")
         with pytest.raises(InputError, match=rf"give a label file \(`labels`\) or `labels={name}`, or an index"):
             find_label_set("mug", unnamed, named=False)
-    assert sets_of(3) == []
+    assert list_sets_of_size(3) == []
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -885,9 +885,9 @@ def test_reference_network_is_small_and_folding_changes_nothing() -> None:
     assert sum(value.numel() * value.element_size() for value in net.state_dict().values()) < 6e6
     x = images(2, 128, 128).permute(0, 3, 1, 2)
     with torch.no_grad():
-        expected, got = net.eval()(x), reference.folded(net)(x)
+        expected, got = net.eval()(x), reference.fold_batch_norms(net)(x)
     torch.testing.assert_close(got, expected, rtol=1e-3, atol=1e-4)
-    assert not any(isinstance(module, nn.BatchNorm2d) for module in reference.folded(net).modules())
+    assert not any(isinstance(module, nn.BatchNorm2d) for module in reference.fold_batch_norms(net).modules())
 
 
 def test_reference_is_stored_and_loaded(tmp_path: Path) -> None:
@@ -919,7 +919,7 @@ def test_reference_files_that_are_wrong(tmp_path: Path) -> None:
 
 
 def test_bundled_reference_or_what_to_do() -> None:
-    if (reference.data_folder() / reference.WEIGHTS).is_file():
+    if (reference.get_data_folder() / reference.WEIGHTS).is_file():
         model = load_model("reference")
         assert "mug" in model.labels and model(images(1, 128, 128)).shape == (1, model.classes)
     else:

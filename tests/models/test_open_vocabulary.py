@@ -188,7 +188,7 @@ def test_its_gradient_is_that_of_differences(tmp_path: Path, family: str) -> Non
     way = torch.randn(image.shape, generator=torch.Generator().manual_seed(1)).double()
 
     def value(given: Tensor) -> Tensor:
-        boxes, scores = model.ask(model.preprocessing(given), raw=True)
+        boxes, scores = model.run_network(model.preprocessing(given), raw=True)
         total: Tensor = scores[0, :, 0].logit().sum() + boxes[0].mean()
         return total
 

@@ -20,9 +20,9 @@ from advsearch.errors import InputError, ModelError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.source import Purpose
 from advsearch.models.zoo import outputs
-from advsearch.models.zoo.transformers import PATIENCE
+from advsearch.models.zoo.transformers import HUB_TIMEOUT
 from advsearch.tasks import Detection
-from advsearch.tasks.boxes import Place
+from advsearch.tasks.boxes import DetectionTruth
 from advsearch.tasks.similarity import Similarity
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
@@ -244,7 +244,7 @@ def test_the_output_of_a_detector_is_read_as_the_library_reads_it(tmp_path: Path
     with torch.no_grad():
         answer = network(pixel_values=PICTURES[:1].permute(0, 3, 1, 2))
         theirs = prepared.post_process_object_detection(answer, threshold=0.0, target_sizes=[(SIDE, SIDE)])[0]
-    ours: Any = task.judge(model(PICTURES[:1]), Place((0,), (0, 0, SIDE, SIDE), (SIDE, SIDE)))[0].payload
+    ours: Any = task.judge(model(PICTURES[:1]), DetectionTruth((0,), (0, 0, SIDE, SIDE), (SIDE, SIDE)))[0].payload
     best = int(theirs["scores"].argmax())
     (found,) = [one for one in ours["found"] if one["score"] == round(float(theirs["scores"][best]), 3)]
     assert found["label"] == NAMES[int(theirs["labels"][best])]
@@ -319,7 +319,7 @@ def test_a_hub_out_of_reach_is_asked_once(tmp_path: Path, monkeypatch: pytest.Mo
         ModelError, match=r"in the cache \(did you mean 'hf:owner/good'\?\).*Check the name and the net"
     ):
         load_model("hf:owner/goood")
-    assert asked == [PATIENCE]
+    assert asked == [HUB_TIMEOUT]
 
 
 def test_it_never_unpickles(tmp_path: Path) -> None:
@@ -401,4 +401,4 @@ def test_a_network_of_timm_from_python_brings_its_own(timm: list[str]) -> None:
     before = load_model(OfTimm(), task=Similarity())
     assert before.labels == ()
     torch.testing.assert_close(before(PICTURES), (PICTURES.mean(dim=(1, 2)) - 0.4) / 0.2)
-    assert timm == [] and outputs.of_timm(nn.Linear(3, 3), Purpose()) is None
+    assert timm == [] and outputs.find_timm_source(nn.Linear(3, 3), Purpose()) is None

@@ -187,7 +187,7 @@ def test_of_synonyms_the_first_is_read(tmp_path: Path) -> None:
 def test_many_names_are_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = published(tmp_path)
     together = load_model(spec, labels=NAMES)(PICTURES)
-    monkeypatch.setattr("advsearch.models.zoo.zero_shot.TEXTS", 3)
+    monkeypatch.setattr("advsearch.models.zoo.zero_shot.TEXT_BATCH_SIZE", 3)
     assert float((load_model(spec, labels=NAMES)(PICTURES) - together).abs().max()) < 1e-4
     with pytest.warns(ModelWarning, match=r"reads 'airplane' \(#0\) and 'automobile' \(#1\) as the same"):
         assert load_model(spec, labels="cifar10").labels == read_labels("cifar10")

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from advsearch.errors import FileFormatError, ModelError, UnknownNameError
 from advsearch.models import ModelWarning, load_model
-from advsearch.models.zoo.library import reading
+from advsearch.models.zoo.library import report_library_errors
 from advsearch.tasks import Detection
 from advsearch.trust.code import allow_named, nothing_allowed
 from fuzz import onnx_files
@@ -215,15 +215,15 @@ def test_a_model_that_only_a_file_names_is_fetched_from_nowhere() -> None:
             socket.create_connection(server.getsockname(), 10.0).close()
 
         with pytest.raises(ModelError, match="a file names the model timm:tiny, which is not on this machine"):
-            with reading("timm:tiny", ""):
+            with report_library_errors("timm:tiny", ""):
                 fetch()
-        with reading("timm:tiny", ""):
+        with report_library_errors("timm:tiny", ""):
             pass
         fetch()  # outside of the block nothing is changed
         for given in ({"model": "reference,timm:tiny@own.safetensors"}, {"model": ["hf:owner/tiny"]}):
             allow_named(given)
         for spec in ("timm:tiny", "timm:tiny@own.safetensors", "hf:owner/tiny"):
-            with reading(spec, ""):
+            with report_library_errors(spec, ""):
                 fetch()
 
 

@@ -18,7 +18,7 @@ import pytest
 import advsearch
 from advsearch.cli.main import main
 from advsearch.engine.gradients import planning
-from advsearch.engine.gradients.planning import cosine_samples, cosines
+from advsearch.engine.gradients.planning import count_cosine_samples, measure_cosines
 from advsearch.errors import InputError
 from advsearch.experiment import RunContext
 from advsearch.interrupts import INTERRUPTS
@@ -207,7 +207,7 @@ class Stop(NullProgress):
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few samples: what is measured says little, but it is measured by the same means."""
-    for function in (cosines, cosine_samples):
+    for function in (measure_cosines, count_cosine_samples):
         monkeypatch.setattr(planning, function.__name__, partial(function, counts=(2,)))
     for name, value in {"FACTORS": (1.0, 3.0), "CONVERGED": 2, "AGAIN": 2}.items():
         monkeypatch.setattr(planning, name, value)
@@ -216,7 +216,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     gain = GainRow.of({**row, "picture_difference": 0.0, "gradient_difference": 0.0})
     monkeypatch.setattr(checking, "measure_gains", lambda *_, **__: [gain])
     length = PathLength(depth=3, full=6, cuts=[], configurations=1, reason="few")
-    monkeypatch.setattr(planning, "bounces_of", lambda *_, **__: length)
+    monkeypatch.setattr(planning, "measure_problem_bounces", lambda *_, **__: length)
 
 
 def timeless(result: CheckResult) -> dict[str, Any]:

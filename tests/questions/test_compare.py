@@ -19,7 +19,7 @@ from advsearch.experiment import RunContext
 from advsearch.options import Value
 from advsearch.questions.compare import CompareConfig
 from advsearch.questions.compare.result import ComparedPair, CompareResult
-from advsearch.questions.report.evidence import claims_of
+from advsearch.questions.report.evidence import collect_claims
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import RunDirectory
@@ -78,7 +78,7 @@ def stored(
                 place = half * pictures + number
                 if keep:
                     picture = np.full((8, 8, 3), luck, np.float32)
-                    thumbnails.keep(run.path, place, thumbnails.thumbnail(picture))
+                    thumbnails.write_thumbnail(run.path, place, thumbnails.make_thumbnail(picture))
                 for model, (name, right) in enumerate(models.items()):
                     is_right = right(elevation, luck) and not (half and luck < 0.5)
                     values: dict[str, Value] = {
@@ -132,7 +132,7 @@ def test_one_sweep_of_two_models_is_counted_pair_by_pair(tmp_path: Path) -> None
     assert [part.first_only for part in pair.parts] == [0, 0, 0, lost]
     kept = read_result(tmp_path / "compared")
     assert isinstance(kept, CompareResult) and kept.pairs == result.pairs
-    (claim,) = claims_of(kept)
+    (claim,) = collect_claims(kept)
     assert claim.kind == "measured" and f"{lost} and low alone in 0" in claim.statement
 
 
@@ -186,7 +186,7 @@ def test_pictures_that_sweeps_kept_are_shown_and_nothing_is_rendered(tmp_path: P
     for one in pair.shown:
         assert one.answers == (("mug", "bowl") if one.right == "mug" else ("bowl", "mug"))
         kept = [(tmp_path / "compared" / name).read_bytes() for name in one.pictures]
-        assert kept == [thumbnails.path_of(run, one.number).read_bytes() for run in two]
+        assert kept == [thumbnails.thumbnail_path(run, one.number).read_bytes() for run in two]
     page = (tmp_path / "compared" / "report.html").read_text("utf-8")
     assert page.count("<img") == 8 and "mug: mug (right)" in page and "<script" not in page.split("<main")[1]
 

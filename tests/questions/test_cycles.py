@@ -71,8 +71,8 @@ def by_cycles(scene: SceneDescription) -> Cycles:
 @pytest.mark.medium
 def test_blender_gets_the_scene_as_it_is(folder: Path, renderer: Renderer) -> None:
     u = torch.full_like(renderer.start, 0.7)
-    made = by_cycles(renderer.scene.made[0])
-    theirs = renderer.like(source=made.radiance)
+    made = by_cycles(renderer.scene.definition[0])
+    theirs = renderer.copy_with(source=made.radiance)
     first, again = (theirs.radiance(u, seed, 4) for seed in (1, 2))
     assert first.shape == (8, 12, 3) and not torch.equal(first, again) and theirs.renders == 2
     told = json.loads((folder / "scene.json").read_text())
@@ -111,7 +111,7 @@ def test_what_blender_can_not_render_is_said(
     (folder / "does.py").write_text(does)
     inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
     with pytest.raises(BlenderError, match=words):
-        by_cycles(renderer.scene.made[0]).radiance(inputs, 0, 1)
+        by_cycles(renderer.scene.definition[0]).radiance(inputs, 0, 1)
 
 
 @pytest.mark.parametrize(
@@ -125,10 +125,10 @@ def test_what_is_not_carried_over_is_said(
     folder: Path, renderer: Renderer, changes: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(BlenderError, match=words):
-        by_cycles(replace(renderer.scene.made[0], **changes))
+        by_cycles(replace(renderer.scene.definition[0], **changes))
 
 
 def test_without_blender_the_command_to_type_is_said(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(BLENDER, "nowhere/blender")
     with pytest.raises(BlenderError, match=r"names nowhere/blender, which can't be run; .*pip install bpy"):
-        by_cycles(renderer.scene.made[0])
+        by_cycles(renderer.scene.definition[0])

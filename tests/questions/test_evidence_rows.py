@@ -16,11 +16,11 @@ from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.explain.result import ExplainResult
 from advsearch.questions.report.evidence import (
-    claims_of,
-    criterion_lines,
-    met,
+    collect_claims,
+    describe_criterion,
+    evaluate_criterion,
+    list_triggering_conditions,
     read_exposure,
-    triggering_conditions,
 )
 from advsearch.report.wording import interval_text, percent
 from advsearch.runs.store import NAME, Store
@@ -56,7 +56,7 @@ def test_every_share_is_that_of_the_rows(tmp_path: Path, capsys: pytest.CaptureF
     assert counted == {key: (right[key], seen[key]) for key in seen} and len(rows) == 8
     for one in run["conditions"]:
         assert one["interval"] == pytest.approx(clopper_pearson(one["right"], one["of"]))
-    verdicts = Counter(met(0.5, tuple(one["interval"])) for one in run["conditions"])
+    verdicts = Counter(evaluate_criterion(0.5, tuple(one["interval"])) for one in run["conditions"])
     told_of = f"met in {verdicts['met']}, not met in {verdicts['not met']} and open in {verdicts['open']} of 6."
     assert told_of in run["criterion"][0] and "environment, camera.azimuth, camera.elevation" in run["criterion"][0]
     assert not any(" of 8 " in line for line in run["criterion"]), "no verdict over a grid that somebody chose"
@@ -82,7 +82,7 @@ def test_every_share_is_that_of_the_rows(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_rules_are_claims_and_triggering_conditions_and_say_whether_they_are_confirmed() -> None:
     result = ExplainResult.of(samples.EXPLAIN)
-    first, *_ = claims_of(result)
+    first, *_ = collect_claims(result)
     assert first.kind == "measured" and first.extent is not None and first.extent.total == 97
     assert "camera.elevation over 60 degrees (rule 1)" in first.statement and "fresh renders" in first.statement
     (rule, *_) = samples.EXPLAIN["rules"]
@@ -92,7 +92,7 @@ def test_rules_are_claims_and_triggering_conditions_and_say_whether_they_are_con
         (None, "Counted on rows that did not choose it, not rendered: "),
     ):
         told = ExplainResult.of({**samples.EXPLAIN, "rules": [{**rule, "confirmed": confirmed}]})
-        assert triggering_conditions(told)[0].startswith(said)
+        assert list_triggering_conditions(told)[0].startswith(said)
 
 
 @pytest.mark.medium
@@ -130,8 +130,12 @@ def test_photographs_from_a_folder_agree_by_condition(tmp_path: Path, capsys: py
 
 
 def test_a_criterion_is_met_not_met_or_open() -> None:
-    assert [met(0.9, ends) for ends in ((0.91, 0.99), (0.5, 0.89), (0.85, 0.95))] == ["met", "not met", "open"]
-    assert criterion_lines([], [], 0.9) == []
+    assert [evaluate_criterion(0.9, ends) for ends in ((0.91, 0.99), (0.5, 0.89), (0.85, 0.95))] == [
+        "met",
+        "not met",
+        "open",
+    ]
+    assert describe_criterion([], [], 0.9) == []
 
 
 @pytest.mark.parametrize(

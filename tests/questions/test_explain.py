@@ -20,9 +20,9 @@ from advsearch.experiment import RunContext
 from advsearch.progress import NullProgress
 from advsearch.questions.explain import renders as explaining
 from advsearch.questions.explain.importance import find_importance
-from advsearch.questions.explain.result import ExplainResult, pairs_text
+from advsearch.questions.explain.result import ExplainResult, describe_pairs
 from advsearch.questions.explain.rows import read_predictions
-from advsearch.questions.explain.sweeps import is_settable, sweep_along, sweep_inside
+from advsearch.questions.explain.sweeps import is_settable, make_sweep_along, make_sweep_inside
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.stored import StoredSweep
 from advsearch.rules import (
@@ -156,15 +156,15 @@ def test_fresh_pictures_vary_as_the_sweep_did_and_count_beyond_the_rules_before(
     table = seen({"camera.elevation": [5.0, 85.0], "camera.azimuth": [10.0, 350.0]}, np.array([True, False]))
     config = SweepConfig(object="mug", controls={"camera": {}}, samples=2)
     high = (RuleCondition("camera.elevation", low=60.0),)
-    made = sweep_inside(config, table, high, 20, 7)
+    made = make_sweep_inside(config, table, high, 20, 7)
     assert made.controls == {"camera": {"elevation": [60.0, 85.0], "azimuth": [10.0, 350.0]}}
     end_on = RuleCondition("camera.azimuth", "degrees", 160.0, 20.0, turn=180.0)
-    drawn = [sweep_inside(config, table, (end_on,), 20, 7, arc).controls["camera"]["azimuth"] for arc in (0, 1)]
+    drawn = [make_sweep_inside(config, table, (end_on,), 20, 7, arc).controls["camera"]["azimuth"] for arc in (0, 1)]
     assert drawn == [[160.0, 200.0], [340.0, 380.0]]
     hue = SweepConfig(object="mug", controls={"background": {"hue": [0, 360]}}, samples=2)
     around = RuleCondition("background.hue", "degrees", 340.0, 20.0, turn=360.0)
     colours = seen({"background.hue": [0.0, 359.0]}, np.array([True, False]))
-    assert sweep_inside(hue, colours, (around,), 20, 7).controls == hue.controls, "a hue ends at 360"
+    assert make_sweep_inside(hue, colours, (around,), 20, 7).controls == hue.controls, "a hue ends at 360"
 
     def rendered(self: Any, name: str, config: SweepConfig) -> pd.DataFrame:
         elevation = np.linspace(20.0, 80.0, 40)
@@ -209,8 +209,8 @@ def test_the_nearest_right_prediction_differs_in_one_value(
     assert several.pairs_sought == 12 and several.pairs[0] == pair and len(several.pairs) >= 6
     assert len({str(one.values) for one in several.pairs}) == len(several.pairs)
     left = several.total - several.right - 12
-    assert f"Of the 12 most typical of {left + 12} failures, {len(several.pairs)} are right" in pairs_text(several)
-    assert f"The other {left} were not tried" in pairs_text(several)
+    assert f"Of the 12 most typical of {left + 12} failures, {len(several.pairs)} are right" in describe_pairs(several)
+    assert f"The other {left} were not tried" in describe_pairs(several)
 
 
 def test_nothing_is_counted_of_failures_for_which_nothing_was_rendered(
@@ -294,7 +294,7 @@ def test_a_sweep_inside_conditions_keeps_what_they_leave() -> None:
         RuleCondition("environment", options=frozenset({"studio"})),
         RuleCondition("light.power", high=1.0),
     )
-    made = sweep_inside(config, TABLE, conditions, 20, 7)
+    made = make_sweep_inside(config, TABLE, conditions, 20, 7)
     assert made.grid == {"pose.yaw": [90.0, 180.0]} and made.environment == "studio" and made.samples == 10
     assert made.controls == {"light": {"power": [0.5, 1.0]}} and made.seed == 7 and made.spp == config.spp
     fresh = pd.DataFrame({"pose.yaw": 90.0, "environment": ["studio", "noon"], "light.power": 0.7})
@@ -308,11 +308,11 @@ def test_a_sweep_along_a_factor_keeps_the_rest() -> None:
     row: dict[str, float | str] = {
         "object": "bowl", "environment": "noon", "model": "reference", "pose.yaw": 90.0, "light.power": 0.5,
     }  # fmt: skip
-    made = sweep_along(config, row, "pose.yaw", TABLE, 3)
+    made = make_sweep_along(config, row, "pose.yaw", TABLE, 3)
     assert made.object == "bowl" and made.environment == "noon" and made.controls == {} and made.keep_pictures == "all"
     assert made.grid["pose.yaw"][0] == 90.0 and len(made.grid["pose.yaw"]) == 9  # type: ignore[index, arg-type]
-    assert made.grid["light.power"] == [0.5] and made.plain()["set"] == {} and made.workers is None
-    lit = sweep_along(config, row, "environment", TABLE, 3)
+    assert made.grid["light.power"] == [0.5] and made.to_json()["set"] == {} and made.workers is None
+    lit = make_sweep_along(config, row, "environment", TABLE, 3)
     assert lit.environment == "noon,studio" and lit.grid["pose.yaw"] == [90.0]
 
 
@@ -324,13 +324,13 @@ def test_numbers_that_follow_from_others_and_axes_are_not_asked_for_again() -> N
     values = {"path.time": [0.0, 1.0], "path.distance": [5.0, 4.0], "camera.fov": [30.0, 40.0]}
     table = seen(values, np.array([False, True]))
     drive = SweepConfig(object="mug", path="approach", fps=1.0, controls={"path": {"reach": 8.0}})
-    made = sweep_along(drive, row, "path.time", table, 3)
+    made = make_sweep_along(drive, row, "path.time", table, 3)
     assert list(made.grid) == ["path.time"] and not is_settable(drive, "path.distance")
     assert made.controls == {"path": {"reach": 8.0}}, "as far as the drive went"
     conditions = tuple(RuleCondition(name, low=0.0) for name in values)
-    assert sweep_inside(drive, table, conditions, 20, 7).controls == {"path": {"reach": 8.0}}
+    assert make_sweep_inside(drive, table, conditions, 20, 7).controls == {"path": {"reach": 8.0}}
     beside = SweepConfig(object="mug", grid={"camera.fov": [30.0, 40.0]}, controls={"camera": {"roll": [-5, 5]}})
-    inside = sweep_inside(beside, table, (RuleCondition("camera.fov", low=35.0),), 20, 7)
+    inside = make_sweep_inside(beside, table, (RuleCondition("camera.fov", low=35.0),), 20, 7)
     assert inside.controls == {"camera": {"roll": [-5, 5]}} and inside.grid == {"camera.fov": [40.0]}
 
 

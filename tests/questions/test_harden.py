@@ -18,13 +18,13 @@ from advsearch.attacks import make_policy
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.loading import Scene
-from advsearch.engine.surface_light import refusal_of_surface_light
+from advsearch.engine.surface_light import find_surface_light_refusal
 from advsearch.errors import InputError, ModelError
 from advsearch.experiment import Experiment
 from advsearch.models import Model
 from advsearch.models.reference import load
 from advsearch.progress import NullProgress
-from advsearch.questions.attack.carry_out import executor_for, problem_of
+from advsearch.questions.attack.carry_out import make_problem_on, open_executor
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden import carry_out as hardening
 from advsearch.questions.harden import harden as asked
@@ -33,9 +33,9 @@ from advsearch.questions.harden import training
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson
 from advsearch.questions.harden.networks import Trainable
 from advsearch.questions.harden.result import QUICK, HardenConfig
-from advsearch.questions.harden.rounds import ROUNDS, Rounds, Score
-from advsearch.questions.harden.scenes import FURTHER, TRAINING, VALIDATION, SceneWork, Wanted
-from advsearch.questions.harden.training import ClassifierCourse
+from advsearch.questions.harden.rounds import ROUNDS_NOTE, Rounds, Score
+from advsearch.questions.harden.scenes import FURTHER, TRAINING, VALIDATION, Job, SceneJobs
+from advsearch.questions.harden.training import ClassifierTrainer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_result
 
@@ -70,19 +70,19 @@ def test_a_run_trains_measures_and_goes_on(
     given = {**SMALL, "labels": "labels.json", "run": "run"}
     config = HardenConfig(**given)
     given.pop("model")
-    taught = ClassifierCourse.round
+    taught = ClassifierTrainer.round
 
     def stopped(self: Any, number: int, *args: Any) -> None:
         if number == 2:
             raise KeyboardInterrupt
         taught(self, number, *args)
 
-    monkeypatch.setattr(ClassifierCourse, "round", stopped)
+    monkeypatch.setattr(ClassifierTrainer, "round", stopped)
     first = asked.run(config)
     assert (first.ending, len(first.rounds), first.after, first.hardened) == ("interrupted", 2, None, None)
     both = [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
     assert attacks == both
-    monkeypatch.setattr(ClassifierCourse, "round", taught)
+    monkeypatch.setattr(ClassifierTrainer, "round", taught)
     with pytest.raises(InputError, match="cannot resume: it began without `beside`, which only Python gives"):
         advsearch.harden(SMALL["model"], beside=[], resume=True, **given)
     result = advsearch.harden(SMALL["model"], resume=True, **given)
@@ -109,31 +109,31 @@ def test_a_run_trains_measures_and_goes_on(
     )
 
 
-def drawing(number: int, control: str, plain: int = 0, beside: tuple[str, ...] = ()) -> Wanted:
+def drawing(number: int, control: str, plain: int = 0, beside: tuple[str, ...] = ()) -> Job:
     how: dict[str, Any] = {"controls": (control,), "views": 1, "plain": plain, "varying_controls": beside}
-    return partial(SceneWork.drawn, split=TRAINING, number=number, **how)
+    return partial(SceneJobs.sample_lessons, split=TRAINING, number=number, **how)
 
 
-def course_of(config: HardenConfig, net: torch.nn.Module | None = None) -> ClassifierCourse:
+def course_of(config: HardenConfig, net: torch.nn.Module | None = None) -> ClassifierTrainer:
     """The training of a small network in the place of the reference model."""
-    work = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
-    return ClassifierCourse(work, Trainable(net or torch.nn.Linear(2, 3), load()))
+    work = SceneJobs(config, load(), harden_scenes.make_splits(config, load()))
+    return ClassifierTrainer(work, Trainable(net or torch.nn.Linear(2, 3), load()))
 
 
 @pytest.mark.medium
 def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**{**SMALL, "controls": "texture,pose,light", "labels": "labels.json"})
     course = course_of(config)
-    found = course.draw("scenes", TRAINING, range(1))
-    held_back = course.draw("scenes", VALIDATION, range(1))
+    found = course.sample_items("scenes", TRAINING, range(1))
+    held_back = course.sample_items("scenes", VALIDATION, range(1))
     with RunDirectory.create_for(config) as run:
-        counts = hardening.Hardening(run, course).counts
+        counts = hardening.Hardening(run, course).n_scenes
     assert counts[FURTHER] == 2 * counts[TRAINING]
     assert [type(one) for one in held_back] == [TextureLesson] * 2 + [Lesson] + [RenderedLesson] * 2
     rendered = [RenderedLesson, Lesson, RenderedLesson, RenderedLesson]  # one scene as it is, too
     assert [type(one) for one in found] == [TextureLesson, Lesson, *rendered]
-    tries = [len(one.pictures) for one in [*found, *held_back] if isinstance(one, RenderedLesson)]
-    assert tries == [1] * 3 + [harden_scenes.TRIES_TO_CHOOSE] * 2
+    tries = [len(one.images) for one in [*found, *held_back] if isinstance(one, RenderedLesson)]
+    assert tries == [1] * 3 + [harden_scenes.N_VALIDATION_TRIES] * 2
     shutil.rmtree(run.path)
 
 
@@ -143,26 +143,27 @@ def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(
 ) -> None:
     config = HardenConfig(**{**SMALL, "controls": "texture,pose,haze", "labels": "labels.json"})
     course = course_of(config)
-    assert course.work.beside == ("pose",)  # no matrix says what haze does
-    drawn = [course.chance("texture", number) for number in range(400)]
-    for share, which in ((training.SHARED, 0), (training.MOVED, 1)):
+    assert course.work.random_controls == ("pose",)  # no matrix says what haze does
+    drawn = [course.sample_scene_options("texture", number) for number in range(400)]
+    for share, which in ((training.SHARED_TEXTURE_PROBABILITY, 0), (training.RANDOM_CONTROLS_PROBABILITY, 1)):
         for part in (drawn[::2], drawn[1::2]):  # objects take turns, and each has as many
             assert abs(sum(one[which] for one in part) / 200 - share) < 0.08
     seen = course.work([drawing(0, "texture", beside=beside) for beside in ((), ("pose",))])
     one, other = (some[0] for some in seen)
     assert isinstance(one, TextureLesson) and isinstance(other, TextureLesson)
-    assert len(other.numbers) == len(one.numbers) + 6 and not torch.equal(one.plain, other.plain)
+    assert len(other.conditions) == len(one.conditions) + 6 and not torch.equal(one.plain_image, other.plain_image)
 
 
 @pytest.mark.medium
 def test_a_measurement_over_viewpoints_may_be_predicted() -> None:
     """Its searches are those of `attack`; a quick one looks at too few pictures."""
     config = HardenConfig(**{**SMALL, "object": "mug", "model": "reference", "controls": "camera", "epsilon": None})
-    work = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
-    name, scene = work.splits["held out"].scene(0)
-    problem = problem_of(work.attack(("camera",), name), scene, work.model)
+    work = SceneJobs(config, load(), harden_scenes.make_splits(config, load()))
+    name, scene = work.splits["held out"].load_scene(0)
+    problem = make_problem_on(work.make_attack_config(("camera",), name), scene, work.model)
     against = [
-        refusal_of_surface_light(problem, steps, make_policy("auto"), True) for steps in (config.steps, QUICK["steps"])
+        find_surface_light_refusal(problem, steps, make_policy("auto"), True)
+        for steps in (config.steps, QUICK["steps"])
     ]
     assert against[0] is None and str(against[1]) == "light on surfaces pays from 32 pictures on"
 
@@ -172,20 +173,20 @@ def test_workers_do_what_this_process_does(attacks: list[tuple[str, int | None]]
     config = HardenConfig(**{**SMALL, "model": "reference", "controls": "texture,pose", "epsilon": {"texture": 0.03}})
     state = load().copy_network().state_dict()  # channels last, which safetensors refuses
     weights = safetensors.save({name: one.contiguous() for name, one in state.items()})
-    looking = partial(SceneWork.looked_at, number=0, weights=weights)
+    looking = partial(SceneJobs.evaluate_plain_images, number=0, weights=weights)
     wanted = [drawing(1, "texture", plain=1), drawing(0, "pose"), looking]
-    here = SceneWork(config, load(), harden_scenes.splits_of(config, load()))(wanted)
+    here = SceneJobs(config, load(), harden_scenes.make_splits(config, load()))(wanted)
     shared = config.model_copy(update={"workers": 1})
-    with executor_for(shared, "advsearch.questions.harden.scenes:load_scene_work", NullProgress()) as pool:
+    with open_executor(shared, "advsearch.questions.harden.scenes:load_scene_work", NullProgress()) as pool:
         assert pool is not None
-        there = {wanted.index(done.items[0]): done.value[0] for done in pool.results([one] for one in wanted)}
+        there = {wanted.index(done.items[0]): done.value[0] for done in pool.compute([one] for one in wanted)}
     assert there.pop(2) == here.pop() == {"before": [True] * 2, "after": [True] * 2}
     for place, lessons in enumerate(here):
         assert isinstance(lessons, list) and len(lessons) == len(there[place])
         for one, other in zip(lessons, there[place], strict=True):
             assert type(one) is type(other) and torch.equal(one.plain, other.plain)
             if isinstance(one, TextureLesson) and isinstance(other, TextureLesson):
-                torch.testing.assert_close(one.picture(one.texture), other.picture(other.texture))
+                torch.testing.assert_close(one.compute_image(one.texture), other.compute_image(other.texture))
 
 
 @pytest.mark.medium
@@ -194,7 +195,7 @@ def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple
     rows = [(0.9, 0.2), (0.89, 0.5), (0.87, 0.8), (0.885, 0.5)]
     with RunDirectory.create_for(config) as run:
         noted = [{"lessons": 1, "part": 1.0, "clean": clean, "robust": robust, "kept": False} for clean, robust in rows]
-        run.store.set_note(ROUNDS, json.dumps(noted))
+        run.store.set_note(ROUNDS_NOTE, json.dumps(noted))
         for loss, best in ((0.02, 3), (0.05, 2), (0.0, 0)):
             course = course_of(config.model_copy(update={"clean_loss": loss}))
             assert Rounds(run, course).best == best
@@ -211,14 +212,14 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
 
     judged_at = list[float]()
 
-    def judged(self: ClassifierCourse, held_back: Any) -> Score:
+    def judged(self: ClassifierTrainer, held_back: Any) -> Score:
         part = float(net.weight.detach()[0, 0] - given["weight"][0, 0])
         judged_at.append(part)
         return Score(1.0 - 0.1 * part, 0.5 + 0.2 * part)
 
-    monkeypatch.setattr(ClassifierCourse, "score", judged)
+    monkeypatch.setattr(ClassifierTrainer, "score", judged)
     with RunDirectory.create_for(config) as run:
-        Rounds(run, course_of(config, net)).keep(0, [], Score(1.0, 0.5), 0, 0.0)
+        Rounds(run, course_of(config, net)).store_round(0, [], Score(1.0, 0.5), 0, 0.0)
         for loss, expected, looked_at in ((0.05, 0.4, 6), (0.2, 1.0, 2), (0.001, 0.25, 6)):
             judged_at.clear()
             net.load_state_dict({name: one + 1.0 for name, one in given.items()})
@@ -226,7 +227,7 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
             advanced = list[int]()
             watcher: Any = SimpleNamespace(advance=lambda n, worst, told=advanced: told.append(n))
             rounds.progress = watcher
-            found, part = rounds.mixed([])
+            found, part = rounds.select_interpolation([])
             assert sum(advanced) == looked_at, "whoever watches sees each part of the way"
             assert part == expected and found.robust == pytest.approx(0.5 + 0.2 * part)
             assert len(judged_at) == looked_at, "less than the best part is looked at once"

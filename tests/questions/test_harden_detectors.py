@@ -16,13 +16,13 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.questions.harden.detectors import DetectorCourse, Example, own_loss, read_coco
-from advsearch.questions.harden.networks import trainable
+from advsearch.questions.harden.detectors import DetectorTrainer, Example, compute_network_loss, read_coco
+from advsearch.questions.harden.networks import make_trainable
 from advsearch.questions.harden.result import HardenConfig
-from advsearch.questions.harden.scenes import SceneWork
+from advsearch.questions.harden.scenes import SceneJobs
 from advsearch.runs.files import write_png
 from advsearch.tasks import make_task
-from advsearch.tasks.boxes import Place
+from advsearch.tasks.boxes import DetectionTruth
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -55,9 +55,9 @@ def model() -> advsearch.Model:
     return advsearch.load_model(OneBox(), task=TASK, labels=LABELS, input_size=SIDE, name="one box")
 
 
-def course_of(loss: Any = None, **settings: Any) -> DetectorCourse:
-    work = SceneWork(HardenConfig(task=TASK, **settings), model(), {})
-    return DetectorCourse(work, trainable(work.model, logits=False), loss=loss)
+def course_of(loss: Any = None, **settings: Any) -> DetectorTrainer:
+    work = SceneJobs(HardenConfig(task=TASK, **settings), model(), {})
+    return DetectorTrainer(work, make_trainable(work.model, logits=False), loss=loss)
 
 
 def example(seed: int) -> Example:
@@ -69,7 +69,7 @@ def example(seed: int) -> Example:
     box = (left, top, left + 20, top + 20)
     task = make_task(TASK).on(model())
     boxes, labels = torch.tensor([box], dtype=torch.float32), torch.tensor([label])
-    return Example(levels, boxes, labels, task, Place((label,), box, (48, 48)))
+    return Example(levels, boxes, labels, task, DetectionTruth((label,), box, (48, 48)))
 
 
 @pytest.mark.medium
@@ -77,15 +77,15 @@ def test_a_copy_learns_by_the_networks_own_loss_and_keeps_its_statistics() -> No
     course, seen = course_of(epochs=60, rate=0.02), [example(k) for k in range(24)]
     course.round(1, seen)
     models, held_out = (course.work.model, course.student.model), [example(k) for k in range(100, 112)]
-    before, after = ([one.right(which) for one in held_out] for which in models)
+    before, after = ([one.is_right(which) for one in held_out] for which in models)
     assert sum(before) <= 3 and sum(after) >= 9
-    network = course.student.net
+    network = course.student.network
     assert isinstance(network, OneBox) and not network.norm.running_mean.any()  # type: ignore[union-attr]
 
 
 def test_a_mirrored_picture_has_mirrored_boxes() -> None:
     course, one = course_of(), example(4)
-    (plain, target), (mirrored, other) = (course.shown(one, which) for which in (False, True))
+    (plain, target), (mirrored, other) = (course.make_input(one, which) for which in (False, True))
     assert torch.allclose(mirrored, plain.flip(3), atol=1e-5)
     assert target["boxes"].tolist() == (one.boxes / 2).tolist()
     left, top, right, bottom = target["boxes"][0].tolist()
@@ -112,13 +112,13 @@ def test_losses_are_torchvisions_transformers_or_the_callers() -> None:
             if config:
                 vars(self.network)["config"] = SimpleNamespace()
 
-    assert float(own_loss(Wrapped(False), x, target)) == 5.0 and seen[-1][0][1] == target
+    assert float(compute_network_loss(Wrapped(False), x, target)) == 5.0 and seen[-1][0][1] == target
     assert [tuple(one.shape) for one in seen[-1][0][0]] == [(3, 20, 40)]
-    assert float(own_loss(Wrapped(True), x, target)) == 7.0
+    assert float(compute_network_loss(Wrapped(True), x, target)) == 7.0
     (named,) = seen[-1][1]["labels"]
     assert named["boxes"].tolist() == [[0.5, 0.5, 0.5, 0.5]] and named["class_labels"].tolist() == [1]
     with pytest.raises(ModelError, match="returns no loss"):
-        own_loss(nn.Flatten(), x, target)
+        compute_network_loss(nn.Flatten(), x, target)
     asked: list[int] = []
 
     def mine(network: nn.Module, x: Tensor, targets: Sequence[Mapping[str, Tensor]]) -> Tensor:
@@ -173,17 +173,17 @@ def test_a_run_trains_on_what_it_found_and_measures_scene_by_scene(
     monkeypatch.setattr("advsearch.questions.harden.scenes.CLEAN_SCENES", 1)
     with pytest.raises(InputError, match="COCO folder as `data`"):
         advsearch.harden(OneBox(), beside=[], **given)
-    given["data"], taught = str(coco(tmp_path / "own")), DetectorCourse.round
+    given["data"], taught = str(coco(tmp_path / "own")), DetectorTrainer.round
 
-    def stopped(self: DetectorCourse, number: int, *args: Any) -> None:
+    def stopped(self: DetectorTrainer, number: int, *args: Any) -> None:
         if number == 2:
             raise KeyboardInterrupt
         taught(self, number, *args)
 
-    monkeypatch.setattr(DetectorCourse, "round", stopped)
+    monkeypatch.setattr(DetectorTrainer, "round", stopped)
     first = advsearch.harden(OneBox(), **given)
     assert first.ending == "interrupted" and first.after is None
-    monkeypatch.setattr(DetectorCourse, "round", taught)
+    monkeypatch.setattr(DetectorTrainer, "round", taught)
     result = advsearch.harden(OneBox(), resume=True, **given)
     assert [one.robust for one in result.rounds[:2]] == [one.robust for one in first.rounds]
     assert result.ending == "done" and result.weights and result.hardened is None

@@ -12,12 +12,12 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.errors import InputError
-from advsearch.questions.harden.detectors import Example, SegmenterCourse, pixel_loss
-from advsearch.questions.harden.networks import trainable
+from advsearch.questions.harden.detectors import Example, SegmenterTrainer, compute_pixel_loss
+from advsearch.questions.harden.networks import make_trainable
 from advsearch.questions.harden.result import HardenConfig
-from advsearch.questions.harden.scenes import SceneWork
+from advsearch.questions.harden.scenes import SceneJobs
 from advsearch.tasks import make_task
-from advsearch.tasks.segmentation import Region, Segmentation
+from advsearch.tasks.segmentation import Segmentation, SegmentationTruth
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -43,9 +43,9 @@ def model() -> advsearch.Model:
     return advsearch.load_model(ByColour(), task="segmentation", labels=LABELS, input_size=SIDE, name="by colour")
 
 
-def course_of(loss: Any = None, **settings: Any) -> SegmenterCourse:
-    work = SceneWork(HardenConfig(task="segmentation", **settings), model(), {})
-    return SegmenterCourse(work, trainable(work.model, logits=False), loss=loss)
+def course_of(loss: Any = None, **settings: Any) -> SegmenterTrainer:
+    work = SceneJobs(HardenConfig(task="segmentation", **settings), model(), {})
+    return SegmenterTrainer(work, make_trainable(work.model, logits=False), loss=loss)
 
 
 def example(label: int, left: int) -> Example:
@@ -55,7 +55,7 @@ def example(label: int, left: int) -> Example:
     mask = torch.zeros((SIDE, SIDE), dtype=torch.bool)
     mask[4:9, left : left + 5] = True
     task = make_task("segmentation").on(model())
-    return Example(levels, torch.zeros((0, 4)), torch.zeros(0), task, Region((label,), mask))
+    return Example(levels, torch.zeros((0, 4)), torch.zeros(0), task, SegmentationTruth((label,), mask))
 
 
 @pytest.mark.medium
@@ -63,8 +63,8 @@ def test_a_copy_learns_the_objects_pixels_and_leaves_the_others_as_they_were() -
     course, seen = course_of(epochs=80, rate=0.1), [example(1 + k % 2, k) for k in range(8)]
     course.round(1, seen)
     held_out = [example(1, 10), example(2, 9)]
-    assert [one.right(course.work.model) for one in held_out] == [False, False]
-    assert [one.right(course.student.model) for one in held_out] == [True, True]
+    assert [one.is_right(course.work.model) for one in held_out] == [False, False]
+    assert [one.is_right(course.student.model) for one in held_out] == [True, True]
     for one in held_out:
         said = course.student.model(one.levels[None] / 255.0)[0].argmax(dim=0)
         region: Any = one.truth
@@ -74,7 +74,7 @@ def test_a_copy_learns_the_objects_pixels_and_leaves_the_others_as_they_were() -
 @pytest.mark.medium
 def test_a_mirrored_picture_has_a_mirrored_mask() -> None:
     course, one = course_of(), example(2, 3)
-    (plain, target), (mirrored, other) = (course.shown(one, which) for which in (False, True))
+    (plain, target), (mirrored, other) = (course.make_input(one, which) for which in (False, True))
     assert torch.allclose(mirrored, plain.flip(3), atol=1e-5)
     assert (other["classes"] == target["classes"].flip(1)).all() and (other["object"] == target["object"].flip(1)).all()
     region: Any = one.truth
@@ -95,13 +95,13 @@ def test_the_loss_is_transformers_or_the_callers_or_that_of_the_pixels() -> None
 
     published = Published()
     vars(published)["config"] = SimpleNamespace()
-    assert float(pixel_loss(task, published, torch.zeros(1, 3, 4, 4), target)) == 7.0
+    assert float(compute_pixel_loss(task, published, torch.zeros(1, 3, 4, 4), target)) == 7.0
     assert (seen[0]["labels"] == classes).all()
     expected = 0.5 * -float(torch.log_softmax(torch.tensor([2.0, 0.0, 0.0]), 0)[0])
-    given = pixel_loss(task, ByColour(), torch.zeros(1, 3, 4, 4), target)
+    given = compute_pixel_loss(task, ByColour(), torch.zeros(1, 3, 4, 4), target)
     assert given.item() == pytest.approx(expected)
     own = course_of(loss=lambda network, x, targets: torch.tensor(1.0))
-    assert own.loss(own.student.net, torch.zeros(1), target) == 1.0
+    assert own.loss(own.student.network, torch.zeros(1), target) == 1.0
 
 
 @pytest.mark.medium

@@ -22,36 +22,36 @@ from advsearch.attacks import Block, Domain
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
-from advsearch.questions.attack.carry_out import problem_of
+from advsearch.questions.attack.carry_out import make_problem_on
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.harden.carry_out import _share
-from advsearch.questions.harden.changed_light import white_light_changed
+from advsearch.questions.harden.carry_out import make_share
+from advsearch.questions.harden.changed_light import change_white_light
 from advsearch.questions.harden.lessons import (
-    PICTURES,
+    IMAGE_DIRECTORY,
     Lesson,
     RenderedLesson,
     TextureLesson,
-    harder,
-    lessons,
-    save_pictures,
-    surprise,
-    tried,
+    make_lessons,
+    negative_log_likelihood,
+    sample_configurations,
+    save_lesson_images,
+    search_worse_images,
 )
-from advsearch.questions.harden.networks import Trainable, one_thread_each, trainable
+from advsearch.questions.harden.networks import Trainable, make_trainable, open_single_threaded_pool
 from advsearch.questions.harden.result import HardenConfig, TrainingRound
-from advsearch.questions.harden.rounds import Rounds, Score, warm_up_fraction
+from advsearch.questions.harden.rounds import Rounds, Score, adjust_warm_up
 from advsearch.questions.harden.scenes import (
     HELD_OUT,
     TRAINING,
-    SceneSide,
-    SceneWork,
+    SceneJobs,
+    SceneSplit,
     check_disjoint,
-    check_unmeasured,
-    fingerprint,
+    check_not_held_out,
+    compute_fingerprint,
 )
-from advsearch.questions.harden.training import ClassifierCourse, Gradients
+from advsearch.questions.harden.training import ClassifierTrainer, GradientComputer
 from advsearch.runs.directory import RunDirectory
-from advsearch.scene.color import levels_of, to_8_bit
+from advsearch.scene.color import round_to_8_bit, to_uint8
 from advsearch.scene.library import load_environment
 from advsearch.statistics.intervals import clopper_pearson
 from small_models import Colours
@@ -60,11 +60,11 @@ LABELS = [f"class {number}" for number in range(14)]
 
 
 def student(layers: str = "all") -> Trainable:
-    return trainable(load_model(Colours(), labels=LABELS, input_size=16), layers)
+    return make_trainable(load_model(Colours(), labels=LABELS, input_size=16), layers)
 
 
-def course_of(made: Trainable, *given: Any, **settings: Any) -> ClassifierCourse:
-    return ClassifierCourse(SceneWork(HardenConfig(**settings), student().model, {}), made, *given)
+def course_of(made: Trainable, *given: Any, **settings: Any) -> ClassifierTrainer:
+    return ClassifierTrainer(SceneJobs(HardenConfig(**settings), student().model, {}), made, *given)
 
 
 def coloured(right: int, level: float, seed: int) -> Tensor:
@@ -77,13 +77,13 @@ def coloured(right: int, level: float, seed: int) -> Tensor:
 def pupils() -> list[Lesson]:
     """Three classes by their brightest channel, of which the worst pictures show little."""
     worst = [coloured(n % 3, 0.2, 99 + n) for n in range(24)]
-    return [RenderedLesson.of((n % 3,), coloured(n % 3, 0.4, n), one[None]) for n, one in enumerate(worst)]
+    return [RenderedLesson.create((n % 3,), coloured(n % 3, 0.4, n), one[None]) for n, one in enumerate(worst)]
 
 
 def test_half_of_what_is_tried_has_numbers_at_the_ends_of_their_ranges() -> None:
     blocks = (Block(2, low=0.2, high=0.6), Block(1, periodic=True), Block(1, options=3))
     domain = Domain(torch.tensor([0.4, 0.4, 0.5, 0.5]), blocks)
-    drawn = tried(domain, torch.Generator().manual_seed(0), 800)
+    drawn = sample_configurations(domain, torch.Generator().manual_seed(0), 800)
     assert torch.equal(drawn, torch.stack([domain.project(row) for row in drawn]))
     at_ends = (drawn == domain.lower) | (drawn == domain.upper)
     assert not at_ends[:, 2:].any()
@@ -95,7 +95,7 @@ def test_half_of_what_is_tried_has_numbers_at_the_ends_of_their_ranges() -> None
 def test_of_several_controls_each_is_tried_alone_and_all_together() -> None:
     blocks = (Block(2, name="pose.x"), Block(1, name="pose.scale"), Block(3, name="light.power"))
     domain = Domain(torch.full((6,), 0.25), blocks)
-    moved = tried(domain, torch.Generator().manual_seed(0), 9) != 0.25
+    moved = sample_configurations(domain, torch.Generator().manual_seed(0), 9) != 0.25
     pose, light, both = [True] * 3 + [False] * 3, [False] * 3 + [True] * 3, [True] * 6
     assert moved.tolist() == [pose, light, both] * 3
 
@@ -105,7 +105,7 @@ def test_a_scene_to_train_on_is_rendered_with_one_control_moved_and_with_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     settings = {"resolution": (16, 16), "controls": {"pose": {}, "light": {}}, "over": {"camera": {}}}
-    problem = problem_of(
+    problem = make_problem_on(
         AttackConfig(object="mug", **settings, measure="no"), load_scene("mug"), load_model("reference")
     )
     start, wanted = problem.domain.start, list[Tensor]()
@@ -119,13 +119,13 @@ def test_a_scene_to_train_on_is_rendered_with_one_control_moved_and_with_all(
             return torch.zeros((16, 16, 3))
 
     monkeypatch.setattr(type(problem.renderer), "like", lambda self, **changes: Recorder())
-    found = [one for seed in range(30) for one in lessons(problem, 1, seed)]
-    assert {len(one.pictures) for one in found if isinstance(one, RenderedLesson)} == {1} and len(wanted) == 60
+    found = [one for seed in range(30) for one in make_lessons(problem, 1, seed)]
+    assert {len(one.images) for one in found if isinstance(one, RenderedLesson)} == {1} and len(wanted) == 60
     moved = [(bool((u != start)[:pose].any()), bool((u != start)[pose:].any())) for u in wanted]
     assert set(moved[1::2]) == {(True, True)}
     assert min(moved[::2].count(kind) for kind in ((True, False), (False, True))) > 8 and len(set(moved[::2])) == 2
-    (one,) = lessons(problem, 1, 0, tries=4)
-    assert isinstance(one, RenderedLesson) and len(one.pictures) == 4 and torch.equal(wanted[60], start)
+    (one,) = make_lessons(problem, 1, 0, n_tries=4)
+    assert isinstance(one, RenderedLesson) and len(one.images) == 4 and torch.equal(wanted[60], start)
 
 
 def test_lessons_of_textures_let_go_of_their_scene() -> None:
@@ -133,29 +133,31 @@ def test_lessons_of_textures_let_go_of_their_scene() -> None:
     settings = {"resolution": (16, 16), "controls": {"texture": {"resolution": 4}}}
     config = AttackConfig(object="mug", **settings, over={"camera": {}, "environment": {}}, measure="no")
     model = load_model("reference")
-    problem = problem_of(config, load_scene("mug"), model)
-    (lesson,), plain = lessons(problem, 1, 0), [Lesson((0,), torch.zeros((16, 16, 3), dtype=torch.uint8))]
+    problem = make_problem_on(config, load_scene("mug"), model)
+    (lesson,), plain = make_lessons(problem, 1, 0), [Lesson((0,), torch.zeros((16, 16, 3), dtype=torch.uint8))]
     scene = weakref.ref(problem.renderer.scene)
     del problem
     gc.collect()
     assert scene() is None and isinstance(lesson, TextureLesson)
-    harder([lesson], model, 2)
-    assert lesson.worst.shape == (16, 16, 3) and not torch.equal(lesson.worst, lesson.plain)
+    search_worse_images([lesson], model, 2)
+    assert lesson.worst_image.shape == (16, 16, 3) and not torch.equal(lesson.worst_image, lesson.plain_image)
     for views, steps in ((6, 2), (2, 2), (1, 4)):  # of 24 pictures, in two epochs: 20 plain ones, and 6 / views of this
-        assert course_of(student(), epochs=2, views=views).steps([lesson, *plain * 20]) == steps
+        assert course_of(student(), epochs=2, views=views).count_steps([lesson, *plain * 20]) == steps
 
 
 @pytest.mark.parametrize("form", ["texels", "palette", "waves"])
 def test_a_lesson_of_a_texture_comes_back_from_a_worker(form: str) -> None:
     controls = {"texture": {"resolution": 4, "form": form}}
     config = AttackConfig(object="mug", resolution=(16, 16), controls=controls, over={"camera": {}}, measure="no")
-    (lesson,) = lessons(problem_of(config, load_scene("mug"), load_model("reference")), 1, 0)
+    (lesson,) = make_lessons(make_problem_on(config, load_scene("mug"), load_model("reference")), 1, 0)
     returned = pickle.loads(pickle.dumps(lesson))
-    assert isinstance(lesson, TextureLesson) and torch.equal(returned.worst, lesson.worst)
+    assert isinstance(lesson, TextureLesson) and torch.equal(returned.worst, lesson.worst_image)
 
 
 def test_an_epoch_looks_six_times_at_a_scene_with_a_texture() -> None:
-    looks = {views: HardenConfig(controls="texture", views=views).texture_looks for views in (1, 2, 3, 4, 6, 7)}
+    looks = {
+        views: HardenConfig(controls="texture", views=views).texture_uses_per_epoch for views in (1, 2, 3, 4, 6, 7)
+    }
     assert looks == {1: 6, 2: 3, 3: 2, 4: 1, 6: 1, 7: 1}
 
 
@@ -165,33 +167,33 @@ def test_an_epoch_looks_six_times_at_a_scene_with_a_texture() -> None:
 @pytest.mark.medium
 def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
     bundled = Path(str(resources.files("advsearch.bundled")))
-    training = SceneSide(TRAINING, ("ball", "book"), ("noon", "studio"), 1)
-    held = SceneSide(HELD_OUT, ("ball", "book"), ("gallery",), 2)
-    name, scene = training.scene(1)
+    training = SceneSplit(TRAINING, ("ball", "book"), ("noon", "studio"), 1)
+    held = SceneSplit(HELD_OUT, ("ball", "book"), ("gallery",), 2)
+    name, scene = training.load_scene(1)
     assert (name, scene.description.object.label) == ("book", "book")
-    assert repr(training.scene(1)[1]) == repr(scene)
-    assert training.scene(1, {"camera.fov": 30.0})[1].description.number("camera.fov") == 30.0
+    assert repr(training.load_scene(1)[1]) == repr(scene)
+    assert training.load_scene(1, {"camera.fov": 30.0})[1].description.number("camera.fov") == 30.0
     file = shutil.copy(bundled / "data" / "objects" / "ball" / "mesh.ply", tmp_path / "tennis-ball.ply")
-    mine = SceneSide(TRAINING, (str(file),), ("noon",), 1).scene(0)[1]
+    mine = SceneSplit(TRAINING, (str(file),), ("noon",), 1).load_scene(0)[1]
     assert mine.description.object.label == "tennis ball"
     check_disjoint(held, [training])
-    again = SceneSide(TRAINING, held.objects, ("noon",), 2)
-    own, other = (one.scene(0)[1].description.object for one in (held, again))
+    again = SceneSplit(TRAINING, held.objects, ("noon",), 2)
+    own, other = (one.load_scene(0)[1].description.object for one in (held, again))
     assert (
-        fingerprint(next(again.assets(1)))
-        == fingerprint(other)
-        != fingerprint(own)
-        == fingerprint(next(held.assets(1)))
+        compute_fingerprint(next(again.generate_objects(1)))
+        == compute_fingerprint(other)
+        != compute_fingerprint(own)
+        == compute_fingerprint(next(held.generate_objects(1)))
     )
-    check_unmeasured(other, {fingerprint(own)})  # seeds of splits differ by name
+    check_not_held_out(other, {compute_fingerprint(own)})  # seeds of splits differ by name
     with pytest.raises(InputError, match="held_out: ball is an object of the training too"):
-        check_unmeasured(own, {fingerprint(own)})
-    files = [SceneSide(name, (str(file),), (lit,), 1) for name, lit in ((HELD_OUT, "gallery"), (TRAINING, "noon"))]
-    assert len(list(files[0].assets(5))) == 1
+        check_not_held_out(own, {compute_fingerprint(own)})
+    files = [SceneSplit(name, (str(file),), (lit,), 1) for name, lit in ((HELD_OUT, "gallery"), (TRAINING, "noon"))]
+    assert len(list(files[0].generate_objects(5))) == 1
     with pytest.raises(InputError, match="held_out: tennis-ball is an object of the training too"):
         check_disjoint(files[0], files[1:])
     with pytest.raises(InputError, match="held_out_environment: noon is an environment of the training too"):
-        check_disjoint(SceneSide(HELD_OUT, ("ball",), ("noon",), 2), [training])
+        check_disjoint(SceneSplit(HELD_OUT, ("ball",), ("noon",), 2), [training])
 
 
 @pytest.mark.medium
@@ -200,7 +202,7 @@ def test_light_of_some_scenes_is_as_warm_as_a_lamp_or_as_cold_as_a_sky() -> None
     given, rng = load_environment("noon"), np.random.default_rng(0)
     tints = list[float]()
     for _ in range(200):
-        found = white_light_changed(given, rng).radiance
+        found = change_white_light(given, rng).radiance
         factors = (found / given.radiance)[10, 10]
         assert np.allclose(found, given.radiance * factors, rtol=1e-4)
         tints.append(float(np.log(factors[0] / factors[2])))
@@ -214,11 +216,11 @@ def test_light_of_some_scenes_is_as_warm_as_a_lamp_or_as_cold_as_a_sky() -> None
 
 def test_the_model_sees_the_weights_of_a_copy_as_they_change() -> None:
     given = Colours()
-    made = trainable(load_model(given, labels=LABELS, input_size=16))
+    made = make_trainable(load_model(given, labels=LABELS, input_size=16))
     image = torch.rand((1, 16, 16, 3), generator=torch.Generator().manual_seed(0))
     before = made.model(image)
     assert torch.allclose(made.logits(image), before, atol=0.02)  # bfloat16, where the processor has it
-    assert torch.equal(made.logits(image), made.quickly(image))
+    assert torch.equal(made.logits(image), made.evaluation_logits(image))
     with torch.no_grad():
         made.parameters()[-1].add_(1.0)
     assert torch.allclose(made.model(image), before + 1.0)
@@ -234,22 +236,22 @@ def test_the_last_layer_alone_is_trained_where_that_is_asked() -> None:
 def test_programs_and_probabilities_are_refused() -> None:
     program = torch.fx.symbolic_trace(Colours())
     with pytest.raises(ModelError, match="an exported program cannot be trained"):
-        trainable(load_model(program, input_size=16))
+        make_trainable(load_model(program, input_size=16))
     with pytest.warns(UserWarning, match="returns probabilities"):
         model = load_model(nn.Sequential(Colours(), nn.Softmax(dim=1)), input_size=16)
     with pytest.raises(ModelError, match="only a classifier that returns logits"):
-        trainable(model)
+        make_trainable(model)
 
 
 @pytest.mark.medium
 def test_the_reference_model_is_loaded_with_other_weights(tmp_path: Path) -> None:
     from safetensors.torch import save_file
 
-    made = trainable(reference.load())
+    made = make_trainable(reference.load())
     with torch.no_grad():
-        made.net.get_parameter("head.bias").zero_().add_(torch.arange(14.0))
+        made.network.get_parameter("head.bias").zero_().add_(torch.arange(14.0))
     path = tmp_path / "hardened.safetensors"
-    save_file({name: one.contiguous() for name, one in made.net.state_dict().items()}, path)
+    save_file({name: one.contiguous() for name, one in made.network.state_dict().items()}, path)
     loaded = load_model(f"reference@{path}")
     image = torch.rand((1, 128, 128, 3), generator=torch.Generator().manual_seed(0))
     assert loaded.labels == made.model.labels
@@ -262,24 +264,24 @@ def test_the_reference_model_is_loaded_with_other_weights(tmp_path: Path) -> Non
 
 def test_the_worst_of_what_was_rendered_is_that_of_the_model_as_it_is() -> None:
     model = student().model
-    pictures = to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3, 0.6)]))
-    lesson = RenderedLesson.of((1,), pictures[0], pictures)
-    other = RenderedLesson.of((2,), pictures[0], pictures[:2])
-    harder([other, lesson], model)
+    pictures = round_to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3, 0.6)]))
+    lesson = RenderedLesson.create((1,), pictures[0], pictures)
+    other = RenderedLesson.create((2,), pictures[0], pictures[:2])
+    search_worse_images([other, lesson], model)
     for one, right in ((lesson, (1,)), (other, (2,))):
-        loss = surprise(model(one.pictures / 255.0), [right] * len(one.pictures))
-        assert torch.equal(one.worst, pictures[int(loss.argmax())]) and one.pictures.dtype == torch.uint8
-    both = surprise(torch.tensor([[1.0, 1.0, 1.0, 1.0]]), [(0, 2)])
+        loss = negative_log_likelihood(model(one.images / 255.0), [right] * len(one.images))
+        assert torch.equal(one.worst_image, pictures[int(loss.argmax())]) and one.images.dtype == torch.uint8
+    both = negative_log_likelihood(torch.tensor([[1.0, 1.0, 1.0, 1.0]]), [(0, 2)])
     assert both.item() == pytest.approx(0.6931, abs=1e-3)
 
 
 def test_the_worst_picture_is_the_one_whose_loss_was_highest_when_a_model_last_looked() -> None:
-    pictures = to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3, 0.6)]))
-    lesson = RenderedLesson.of((1,), pictures[0], pictures)
+    pictures = round_to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3, 0.6)]))
+    lesson = RenderedLesson.create((1,), pictures[0], pictures)
     rows = [(0.2, 1.0, 0.5), (0.2, 0.1, 0.5), (0.2, 0.1, 0.3), (0.2, 0.1, 0.0)]
     for losses, expected in zip(rows, (1, 2, 2, 0), strict=True):
         lesson.losses = torch.tensor(losses)
-        assert torch.equal(lesson.worst, pictures[expected])
+        assert torch.equal(lesson.worst_image, pictures[expected])
 
 
 def test_a_round_teaches_plain_and_worst_pictures() -> None:
@@ -289,8 +291,8 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     before = course.score(lessons)
     course.round(1, lessons, tick=lambda: ticks.append(1))
     after = course.score(lessons)
-    assert len(ticks) == course.steps(lessons) == 12
-    more = [Lesson((5,), levels_of(coloured(0, 0.4, 1)))] * 24  # nothing makes them harder
+    assert len(ticks) == course.count_steps(lessons) == 12
+    more = [Lesson((5,), to_uint8(coloured(0, 0.4, 1)))] * 24  # nothing makes them harder
     assert course.score([*lessons, *more]) == Score(after.clean / 2, after.robust)
     assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
 
@@ -300,7 +302,7 @@ def test_a_training_of_few_steps_has_a_rate_for_each(fraction: float) -> None:
     for n_rates in range(2, 41):
         optimiser = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], 1.0)
         rates = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, 1.0, total_steps=n_rates, pct_start=warm_up_fraction(fraction, n_rates), cycle_momentum=False
+            optimiser, 1.0, total_steps=n_rates, pct_start=adjust_warm_up(fraction, n_rates), cycle_momentum=False
         )
         for _ in range(n_rates - 1):
             optimiser.step()
@@ -309,8 +311,8 @@ def test_a_training_of_few_steps_has_a_rate_for_each(fraction: float) -> None:
 
 
 def test_to_judge_a_model_leaves_the_lessons_as_they_are() -> None:
-    pictures = to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3)]))
-    lesson = RenderedLesson.of((1,), pictures[0], pictures)
+    pictures = round_to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3)]))
+    lesson = RenderedLesson.create((1,), pictures[0], pictures)
     course_of(student()).score([lesson])
     assert bool(lesson.losses.isinf().all())
 
@@ -332,10 +334,10 @@ def test_the_given_model_is_asked_about_scenes_as_they_are_alone() -> None:
         asked.append(images)
         return student().logits(images).detach()
 
-    plain = [Lesson((n,), levels_of(coloured(n, 0.4, n))) for n in range(3)]
-    with one_thread_each() as pool:
+    plain = [Lesson((n,), to_uint8(coloured(n, 0.4, n))) for n in range(3)]
+    with open_single_threaded_pool() as pool:
         for batch, count in (([*pupils(), *plain], 3), (pupils(), 0)):
-            Gradients(student(), cast(Any, given), pool).take(batch, None, 0)
+            GradientComputer(student(), cast(Any, given), pool).compute(batch, None, 0)
             assert sum(len(one) for one in asked) == count
             asked.clear()
 
@@ -357,13 +359,13 @@ def test_a_round_comes_to_the_same_whatever_the_number_of_threads() -> None:
 class Tinted(TextureLesson):
     """A picture whose texture is its tint."""
 
-    def picture(self, u: Tensor) -> Tensor:
-        return (self.plain + 0.2 * (u - 0.5)).clamp(0.0, 1.0)
+    def compute_image(self, u: Tensor) -> Tensor:
+        return (self.plain_image + 0.2 * (u - 0.5)).clamp(0.0, 1.0)
 
 
 def tinted(number: int) -> TextureLesson:
     nothing: Any = None
-    domain, levels = Domain(torch.full((3,), 0.5), (Block(3),)), levels_of(coloured(number % 3, 0.3, number))
+    domain, levels = Domain(torch.full((3,), 0.5), (Block(3),)), to_uint8(coloured(number % 3, 0.3, number))
     return Tinted((number % 3,), levels, nothing, domain, nothing, nothing, torch.full((3,), 0.5))
 
 
@@ -378,7 +380,7 @@ def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pyt
             number
             for image in images.detach()
             for number, one in enumerate(textured)
-            if torch.equal(image, one.picture(one.texture).detach() if images.requires_grad else one.worst)
+            if torch.equal(image, one.compute_image(one.texture).detach() if images.requires_grad else one.worst_image)
         ]
         if len(owners) == len(images):
             seen.append((owners, seed, images.requires_grad))
@@ -386,8 +388,8 @@ def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pyt
 
     monkeypatch.setattr("advsearch.questions.harden.training._augment", changed)
     made = student()
-    with one_thread_each() as pool:
-        Gradients(made, student().model, pool).take(batch, None, 7)
+    with open_single_threaded_pool() as pool:
+        GradientComputer(made, student().model, pool).compute(batch, None, 7)
     searched = sorted(one[:2] for one in seen if one[2])
     trained = sorted(one[:2] for one in seen if not one[2])
     assert sum(len(owners) for owners, _ in searched) == 9 and searched == trained
@@ -411,8 +413,8 @@ def test_a_round_takes_the_users_optimiser_and_their_batches() -> None:
 
 def test_pictures_are_a_folder_for_each_class_and_a_webdataset(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
-        save_pictures(run, 1, pupils()[:2], ["wine glass", "mug"])
-    pictures = tmp_path / "run" / PICTURES
+        save_lesson_images(run, 1, pupils()[:2], ["wine glass", "mug"])
+    pictures = tmp_path / "run" / IMAGE_DIRECTORY
     assert sorted(one.relative_to(pictures).as_posix() for one in pictures.glob("*/*")) == [
         "0000-wine-glass/001-00000-plain.png",
         "0000-wine-glass/001-00000-worst.png",
@@ -430,9 +432,9 @@ def test_pictures_are_a_folder_for_each_class_and_a_webdataset(tmp_path: Path) -
 def test_the_interval_of_plain_pictures_is_over_scenes_whose_views_are_alike() -> None:
     rng, covered, runs = np.random.default_rng(0), 0, 300
     for _ in range(runs):
-        share = _share(np.repeat(rng.random(56) < 0.85, 2).tolist(), views=2)
+        share = make_share(np.repeat(rng.random(56) < 0.85, 2).tolist(), views=2)
         assert share is not None and share.count == 112
         covered += share.interval[0] <= 0.85 <= share.interval[1]
     assert covered >= 0.94 * runs
-    alone = _share([True] * 9 + [False])
+    alone = make_share([True] * 9 + [False])
     assert alone is not None and alone.interval == clopper_pearson(9, 10)

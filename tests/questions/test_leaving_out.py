@@ -14,14 +14,14 @@ from advsearch import attack, load_scene
 from advsearch.attacks import Query
 from advsearch.cli.output import shown_text as text_of
 from advsearch.controls import CameraControl, LightControl, MaterialControl, TextureControl
-from advsearch.engine.gradients import interior_point, smooth_loss
-from advsearch.engine.gradients.planning import BOUND, measured_bounces
+from advsearch.engine.gradients import find_interior_point, make_smooth_loss
+from advsearch.engine.gradients.planning import MAX_CHANGE, measure_path_length
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check import check
 from advsearch.questions.check.leaving_out import ALL, WHAT, measure_gains, measure_texels
 from advsearch.questions.check.result import CheckConfig
-from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
+from advsearch.scene.formation import ALL_OMISSIONS, NO_OMISSIONS, OMISSIONS
 from advsearch.scene.renderer import Renderer
 from covering import only
 
@@ -36,8 +36,8 @@ def made(controls: Any, object: str = "mug", environment: str = "studio", denois
 @pytest.mark.parametrize("control", only(["texture"], ["texture", "haze"]))
 def test_nothing_that_is_left_out_changes_a_picture_or_a_gradient(control: str) -> None:
     renderer = made(control)
-    loss, u = smooth_loss((SIZE, SIZE)), interior_point(renderer)
-    full = renderer.like(renderer.scene.like(leave_out=NOTHING))
+    loss, u = make_smooth_loss((SIZE, SIZE)), find_interior_point(renderer)
+    full = renderer.copy_with(renderer.scene.copy_with(leave_out=NO_OMISSIONS))
     with torch.no_grad():
         noise = (renderer(u, 100, 4) - renderer(u, 101, 4)).norm()
         for seed in range(3):  # the second is replayed where the first was recorded
@@ -54,15 +54,15 @@ def test_putting_an_item_back_takes_effect(monkeypatch: pytest.MonkeyPatch) -> N
     note: Any = written.append
 
     def adjoints(item: str) -> tuple[set[str], set[str]]:
-        scene = renderer.scene.like(leave_out=EVERYTHING - {item})
-        names = {key: name for name, (key, _) in scene.declared.items()}
+        scene = renderer.scene.copy_with(leave_out=ALL_OMISSIONS - {item})
+        names = {key: name for name, (key, _) in scene.declared_inputs.items()}
         inner = scene.parameters.set_dirty
         monkeypatch.setattr(scene.parameters, "set_dirty", lambda key: [note(names[key]), inner(key)])
-        inputs = {"object.base_color": scene.base("object.base_color") * 0.5}
-        scene.radiance(inputs, 0, 1)
+        inputs = {"object.base_color": scene.get_base_value("object.base_color") * 0.5}
+        scene.render_radiance(inputs, 0, 1)
         by_render = set(written)
         written.clear()
-        scene.adjoint(inputs, torch.ones(SIZE, SIZE, 3), 0, 1)
+        scene.render_adjoint(inputs, torch.ones(SIZE, SIZE, 3), 0, 1)
         by_adjoint = set(written)
         written.clear()
         return by_render, by_adjoint
@@ -80,8 +80,8 @@ def test_putting_an_item_back_takes_effect(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.slow
 def test_gains_have_a_row_for_each_item_and_their_proof() -> None:
     renderer = made("texture")
-    rows = measure_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=2, repeats=2, depth=4)
-    assert [row.item for row in rows] == [*ITEMS, "bounces", ALL]
+    rows = measure_gains(renderer, make_smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=2, repeats=2, depth=4)
+    assert [row.item for row in rows] == [*OMISSIONS, "bounces", ALL]
     assert {row.item for row in rows} == set(WHAT)
     assert all(row.time_gain > 0.0 and row.safe for row in rows)
 
@@ -89,9 +89,9 @@ def test_gains_have_a_row_for_each_item_and_their_proof() -> None:
 @pytest.mark.medium
 def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("advsearch.questions.check.leaving_out.ITEMS", {"tracing": ""})
-    monkeypatch.setattr("advsearch.questions.check.leaving_out.NOTHING", EVERYTHING)
+    monkeypatch.setattr("advsearch.questions.check.leaving_out.NOTHING", ALL_OMISSIONS)
     renderer = made("camera.exposure")
-    rows = measure_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=128, repeats=2, depth=2)
+    rows = measure_gains(renderer, make_smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=128, repeats=2, depth=2)
     tracing, bounces, _ = rows
     assert tracing.picture_difference < 1e-5 and tracing.safe  # a recorded kernel rounds otherwise
     assert tracing.time_gain > 0.0
@@ -101,28 +101,30 @@ def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyP
 @pytest.mark.medium
 def test_bounces_are_cut_where_they_are_dark_and_not_where_they_are_seen() -> None:
     dark, light = made("texture", "bottle", "noon"), made("texture", "mug", "studio")
-    cut = measured_bounces(dark, [dark.start], seed=0, spp=4)
+    cut = measure_path_length(dark, [dark.start], seed=0, spp=4)
     assert cut.depth < cut.full == dark.scene.max_depth
     kept = {one.depth: one for one in cut.cuts}
-    assert kept[cut.depth].levels <= BOUND < kept[cut.depth - 1].levels
+    assert kept[cut.depth].levels <= MAX_CHANGE < kept[cut.depth - 1].levels
     assert "segments leave out" in cut.reason
-    seen = measured_bounces(light, [light.start], seed=0, spp=4)
-    assert seen.depth > cut.depth and seen.cuts[-1].levels > BOUND
+    seen = measure_path_length(light, [light.start], seed=0, spp=4)
+    assert seen.depth > cut.depth and seen.cuts[-1].levels > MAX_CHANGE
     assert dark.scene.depth == dark.scene.max_depth
 
 
 @pytest.mark.medium
 def test_the_measured_bias_does_not_depend_on_the_noise() -> None:
     renderer = made("texture")
-    few, many = (measured_bounces(renderer, [renderer.start], seed=3, spp=spp, bound=1e9).cuts[-1] for spp in (4, 256))
+    few, many = (
+        measure_path_length(renderer, [renderer.start], seed=3, spp=spp, bound=1e9).cuts[-1] for spp in (4, 256)
+    )
     assert few.depth == many.depth == 2 and few.levels == pytest.approx(many.levels, rel=0.2)
     assert few.light == pytest.approx(many.light, rel=0.1)
 
 
 def test_a_black_scene_needs_no_bounces() -> None:
     renderer = made({"camera": {"exposure": [-10.0, -9.0]}})
-    cut = measured_bounces(renderer, [torch.zeros_like(renderer.start)], seed=0, spp=1)
-    assert cut.depth == 2 and cut.cuts[-1].levels <= BOUND
+    cut = measure_path_length(renderer, [torch.zeros_like(renderer.start)], seed=0, spp=1)
+    assert cut.depth == 2 and cut.cuts[-1].levels <= MAX_CHANGE
 
 
 @pytest.mark.medium
@@ -131,7 +133,7 @@ def test_searches_cut_paths_and_verifications_do_not() -> None:
     problem, _ = problem_from_config(config)
     start = problem.domain.start
     seen: list[torch.Tensor] = []
-    searched, tried = Query(start, 0, phase="search", keep=True), Query(start, 3, spp=8)
+    searched, tried = Query(start, 0, phase="search", with_image=True), Query(start, 3, spp=8)
     trial = problem.evaluate(tried)
     for depth, gradient in ((None, False), (2, False), (2, True)):
         problem.search_depth = depth
@@ -139,7 +141,7 @@ def test_searches_cut_paths_and_verifications_do_not() -> None:
         assert picture is not None
         seen.append(picture)
     assert seen[1].mean() < seen[0].mean() - 0.005 and torch.equal(seen[1], seen[2])
-    assert problem.evaluate(tried).said == trial.said
+    assert problem.evaluate(tried).required_judgement == trial.required_judgement
 
 
 @pytest.mark.medium
@@ -182,7 +184,7 @@ def test_a_check_shows_what_is_left_out(specialise: bool, tmp_path: Path) -> Non
     found = check.run(config)
     said = text_of(found)
     if specialise:
-        assert {row.item for row in found.gains} >= {*ITEMS, ALL}
+        assert {row.item for row in found.gains} >= {*OMISSIONS, ALL}
         assert found.bounces is not None and found.bounces.reason in said and "texels of texture" in said
     else:
         assert not found.gains and "nothing (--no-specialise)" in said
@@ -190,17 +192,17 @@ def test_a_check_shows_what_is_left_out(specialise: bool, tmp_path: Path) -> Non
 
 def test_every_input_of_a_light_has_a_base_value() -> None:
     scene = made("light").scene
-    assert all(torch.isfinite(scene.base(name)).all() for name in scene.names)
-    assert scene.base("light.radiance").shape == (3,)
+    assert all(torch.isfinite(scene.get_base_value(name)).all() for name in scene.input_names)
+    assert scene.get_base_value("light.radiance").shape == (3,)
 
 
 def test_a_shorter_path_is_only_for_the_block() -> None:
     scene = made("texture").scene
-    with scene.shorter(3):
+    with scene.limit_depth(3):
         assert scene.depth == 3
-        with scene.shorter(None):
+        with scene.limit_depth(None):
             assert scene.depth == 3
-        with scene.shorter(50):
+        with scene.limit_depth(50):
             assert scene.depth == scene.max_depth
     assert scene.depth == scene.max_depth
 
@@ -214,7 +216,7 @@ def two_lamps(power: float) -> Renderer:
 @pytest.mark.medium
 def test_dark_lamps_get_no_samples_and_change_nothing_but_noise() -> None:
     renderer = two_lamps(0.0)
-    full = renderer.like(renderer.scene.like(leave_out=EVERYTHING - {"emitters"}))
+    full = renderer.copy_with(renderer.scene.copy_with(leave_out=ALL_OMISSIONS - {"emitters"}))
     with torch.no_grad():
         mine, theirs = (torch.stack([one(renderer.start, seed, 16) for seed in range(12)]) for one in (renderer, full))
     noise, other = float(mine.var(0).mean()), float(theirs.var(0).mean())
@@ -247,7 +249,10 @@ def test_a_material_looks_the_same_however_its_numbers_come_and_whatever_is_left
         renderer = load_scene("ball", "studio", settings=settings).renderer([control], resolution=24, denoise="none")
         u = torch.tensor(list(ends.values())) if control is searched else renderer.start
         with torch.no_grad():
-            pictures += [renderer(u, 3, 16), renderer.like(renderer.scene.like(leave_out=NOTHING))(u, 3, 16)]
+            pictures += [
+                renderer(u, 3, 16),
+                renderer.copy_with(renderer.scene.copy_with(leave_out=NO_OMISSIONS))(u, 3, 16),
+            ]
     assert max(float((one - pictures[0]).abs().mean()) for one in pictures) < 1e-3
 
 

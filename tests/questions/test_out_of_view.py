@@ -12,15 +12,15 @@ import pytest
 import advsearch
 import small_models
 from advsearch.errors import InputError
-from advsearch.questions.report.evidence import conditions_of
-from advsearch.questions.sweep.display import distance_of
+from advsearch.questions.report.evidence import count_conditions
+from advsearch.questions.sweep.display import find_detection_distance
 from advsearch.questions.sweep.result import Predictions
 from advsearch.runs.summary import read_result
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement, Prediction
 from advsearch.testing import assert_no_worse, assert_suite
 from advsearch.trust.code import allow_code
-from advsearch.viewer.columns import UNKNOWN, packed, read_columns
+from advsearch.viewer.columns import UNKNOWN, pack_columns, read_columns
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -29,11 +29,11 @@ def test_the_worst_is_a_picture_that_shows_it() -> None:
     found = Predictions(4)
     for number, (label, margin) in enumerate([("car", -3.0), ("out of view", -1.0), ("no car", 2.0)]):
         found.add(number, Judgement.of(margin, -margin, Prediction(label)))
-    assert found.hidden.tolist() == [False, True, False, False] and found.worst == 2
+    assert found.is_hidden.tolist() == [False, True, False, False] and found.worst_row == 2
     found = Predictions(2)
     for number, (label, margin) in enumerate([("car", -3.0), ("out of view", -1.0)]):
         found.add(number, Judgement.of(margin, -margin, Prediction(label)))
-    assert found.worst == 0
+    assert found.worst_row == 0
 
 
 @pytest.mark.medium
@@ -50,13 +50,13 @@ def test_they_are_told_and_not_counted(tmp_path: Path) -> None:
         assert counts["pictures_0"].tolist() == [2] and counts["failures_0"].tolist() == [2 - found.correct]
     assert found.interval == pytest.approx(clopper_pearson(found.correct, 2))
     assert any("In 2 of 4 pictures nothing of the object is to be seen" in one for one in found.warnings)
-    assert {one.value: one.total for one in conditions_of(found)} == {"0.3": 1, "0.5": 1, "0": 2}
-    seen = distance_of(found)
-    assert seen is not None and len(seen.shares) == 2
+    assert {one.value: one.total for one in count_conditions(found)} == {"0.3": 1, "0.5": 1, "0": 2}
+    seen = find_detection_distance(found)
+    assert seen is not None and len(seen.right_fractions) == 2
     rows = read_columns(tmp_path / "run")
     hidden = rows["label"] == "out of view"
     assert hidden.sum() == 2 and rows["correct"][hidden].eq(1).all()  # a row says what the task said
-    data = packed(rows)
+    data = pack_columns(rows)
     size = int.from_bytes(data[:4], "little")
     (right,) = (one for one in json.loads(data[4 : 4 + size])["columns"] if one["name"] == "right")
     begin = 4 + size + right["at"]

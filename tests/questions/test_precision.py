@@ -14,7 +14,7 @@ import pytest
 
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as precision_text
-from advsearch.engine.gradients import smooth_loss
+from advsearch.engine.gradients import make_smooth_loss
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
@@ -23,29 +23,29 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.precision import carry_out as measuring
 from advsearch.questions.precision import precision
 from advsearch.questions.precision.benches import (
-    COUNTS,
-    LEAST,
-    MOST_PARTS,
+    MAX_REFERENCE_PARTS,
+    MIN_CALLS,
+    SAMPLE_COUNTS,
     GradientBench,
     TimeBudget,
     list_gradient_parts,
     measure_in_rounds,
     take_reference_parts,
 )
-from advsearch.questions.precision.carry_out import Measurement, recommend_settings
+from advsearch.questions.precision.carry_out import QuantityMeasurer, recommend_settings
 from advsearch.questions.precision.result import (
     SAMPLERS,
-    WARM_UP,
+    WARM_UP_CALLS,
     PrecisionConfig,
     PrecisionPoint,
     PrecisionResult,
     Recommended,
+    draw_figures,
     list_cautions,
     make_headline,
-    precision_figures,
 )
 from advsearch.questions.precision.rule import (
-    FURTHEST,
+    MAX_EXTRAPOLATION,
     ReferenceValue,
     SampleSetting,
     confirm_recommendation,
@@ -61,7 +61,7 @@ from advsearch.questions.precision.rule import (
 )
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_result
-from advsearch.scene.formation import next_count
+from advsearch.scene.formation import round_sample_count
 from advsearch.scene.gradients import Group
 
 SIZE = 400
@@ -105,7 +105,7 @@ def measured(
     for count in COUNTS_TRIED:
         values = [noisy(count, 100 * count + k, bias, power) for k in range(8)]
         samples = [{**reference.compare(value), "seconds": 1e-3 * count} for value in values]
-        points.append(summarize_samples(setting(count, estimator), samples, floor=reference.error))
+        points.append(summarize_samples(setting(count, estimator), samples, reference_error=reference.error))
     return points
 
 
@@ -131,16 +131,16 @@ def test_the_error_of_a_reference_is_what_its_parts_scatter_by() -> None:
 
 def test_two_halves_give_half_their_difference() -> None:
     one, other = np.array([1.0, 2.0]), np.array([1.4, 2.3])
-    assert estimate_reference([one, other]).error * estimate_reference([one, other]).size == pytest.approx(0.25)
+    assert estimate_reference([one, other]).error * estimate_reference([one, other]).norm == pytest.approx(0.25)
 
 
 def test_a_reference_through_a_bend_knows_of_scatter_and_bias() -> None:
     generator = np.random.default_rng(0)
     parts = [1.0 + 0.1 * generator.standard_normal(1) for _ in range(16)]
     found = estimate_reference(parts, np.exp)
-    assert found.error * found.size == pytest.approx(math.e * 0.1 / 4.0, rel=0.4)
+    assert found.error * found.norm == pytest.approx(math.e * 0.1 / 4.0, rel=0.4)
     error = float(np.std(parts, ddof=1)) / 4.0
-    assert estimate_reference(parts).error * estimate_reference(parts).size == pytest.approx(error, rel=1e-9)
+    assert estimate_reference(parts).error * estimate_reference(parts).norm == pytest.approx(error, rel=1e-9)
     assert estimate_reference(parts, bias=1.0).error > 1.0 / 1.2
 
 
@@ -164,7 +164,7 @@ def test_the_reference_s_own_error_is_taken_off() -> None:
     reference = rough(256)
     point = next(one for one in measured(reference) if one.spp == 256)
     true = 256**-0.5 * math.sqrt(SIZE) / float(np.linalg.norm(TRUTH))
-    assert point.known and point.rms == pytest.approx(true, rel=0.06)
+    assert point.is_known and point.rms == pytest.approx(true, rel=0.06)
     assert point.interval is not None and point.interval[0] < point.rms < point.interval[1]
 
 
@@ -172,13 +172,13 @@ def test_no_point_below_the_reference_is_called_known() -> None:
     reference = rough(100)  # 400 samples in all
     for point in measured(reference):
         true = point.spp**-0.5 * math.sqrt(SIZE) / float(np.linalg.norm(TRUTH))
-        assert point.known == (point.spp < 256), point.spp
-        if not point.known:
+        assert point.is_known == (point.spp < 256), point.spp
+        if not point.is_known:
             assert point.rms > true and point.interval is None  # a limit is above the truth
 
 
 def test_seconds_leave_the_warm_up_out() -> None:
-    times = [9.0] * WARM_UP + [1.0, 3.0, 2.0]
+    times = [9.0] * WARM_UP_CALLS + [1.0, 3.0, 2.0]
     assert median_time(times) == 2.0
     assert median_time([9.0, 4.0]) == 4.0
 
@@ -289,7 +289,9 @@ def test_a_line_that_explains_all_points_overrules_a_lucky_one() -> None:
     assert recommend_count([point_at(one.spp, max(one.rms, 0.2), (0.19, 0.21)) for one in true], 0.1) is None
 
 
-@pytest.mark.parametrize(("error", "times", "promised"), [(0.08, 1, 0.08), (0.2, 4, 0.1), (10.0, FURTHEST, 2.5)])
+@pytest.mark.parametrize(
+    ("error", "times", "promised"), [(0.08, 1, 0.08), (0.2, 4, 0.1), (10.0, MAX_EXTRAPOLATION, 2.5)]
+)
 def test_new_measurements_of_a_recommended_setting_are_what_is_promised(
     error: float, times: int, promised: float
 ) -> None:
@@ -333,7 +335,7 @@ def test_beyond_the_last_point_it_says_so_and_not_too_far() -> None:
     found, spp, _ = reached(recommend_count(points, 0.5 * points[-1].rms))
     assert found.basis == "extrapolated"
     assert error_at(spp) == pytest.approx(found.goal, rel=0.15)
-    assert recommend_count(points, points[-1].rms / FURTHEST) is None
+    assert recommend_count(points, points[-1].rms / MAX_EXTRAPOLATION) is None
 
 
 def test_what_levels_off_is_never_recommended_below_its_level() -> None:
@@ -346,7 +348,7 @@ def test_what_levels_off_is_never_recommended_below_its_level() -> None:
 
 def test_a_count_is_rounded_to_what_the_sampler_takes() -> None:
     _, spp, error = reached(
-        recommend_count(measured(exact()), 0.1, lambda point, samples: next_count("ldsampler", samples))
+        recommend_count(measured(exact()), 0.1, lambda point, samples: round_sample_count("ldsampler", samples))
     )
     assert math.log(spp, 4) == pytest.approx(round(math.log(spp, 4)))
     assert error <= 0.1
@@ -380,7 +382,7 @@ def test_rounds_are_interleaved_cheapest_first_with_a_seed_each() -> None:
     measured = measure_in_rounds(settings, timed(clock), budget, rounds=3, seed=0, on_done=note)
     assert order == [4.0] * 4 + [16.0] * 4 + [4.0, 4.0, 16.0, 16.0] * 2
     given = [seed for taken in measured.results.values() for seed, _ in taken]
-    assert len(set(given)) == len(given) == 16 and measured.left_out == []
+    assert len(set(given)) == len(given) == 16 and measured.skipped == []
 
 
 @pytest.mark.parametrize("seconds", [0.5, 3.0, 20.0])
@@ -390,10 +392,10 @@ def test_a_budget_is_kept_and_what_was_left_out_is_said(seconds: float, cold: fl
     settings = [setting(count, name) for name in ("a", "b", "c") for count in COUNTS_TRIED]
     measured = measure_in_rounds(settings, timed(clock, cold=cold), TimeBudget(seconds, clock), rounds=50, seed=0)
     assert clock.now <= seconds + 3 * cold
-    assert {*measured.left_out} | {*measured.results} == {*settings}
-    if measured.left_out and cold == 0.0:
-        assert max(one.cost for one in measured.results) <= min(one.cost for one in measured.left_out)
-        assert min(len(taken) for taken in measured.results.values()) >= LEAST
+    assert {*measured.skipped} | {*measured.results} == {*settings}
+    if measured.skipped and cold == 0.0:
+        assert max(one.cost for one in measured.results) <= min(one.cost for one in measured.skipped)
+        assert min(len(taken) for taken in measured.results.values()) >= MIN_CALLS
 
 
 def test_what_compiles_first_is_never_taken_for_the_time_of_a_setting() -> None:
@@ -403,7 +405,7 @@ def test_what_compiles_first_is_never_taken_for_the_time_of_a_setting() -> None:
         [setting(4), setting(16)], timed(clock, cold=40.0), TimeBudget(10.0, clock), rounds=8, seed=0
     )
     (taken,) = measured.results.values()
-    assert median_time([seconds for _, seconds in taken]) == pytest.approx(0.004) and measured.left_out == [setting(16)]
+    assert median_time([seconds for _, seconds in taken]) == pytest.approx(0.004) and measured.skipped == [setting(16)]
 
 
 def test_a_machine_that_is_busy_and_pixels_that_hold_the_error_are_said() -> None:
@@ -419,10 +421,10 @@ def test_a_part_of_a_budget_is_a_budget() -> None:
     clock = Clock()
     whole = TimeBudget(10.0, clock)
     clock.now = 2.0
-    part = whole.share(0.25)
-    assert (whole.left, part.left) == (8.0, 2.0)
+    part = whole.take_fraction(0.25)
+    assert (whole.seconds_left, part.seconds_left) == (8.0, 2.0)
     clock.now = 50.0
-    assert (whole.left, part.left) == (0.0, 0.0)
+    assert (whole.seconds_left, part.seconds_left) == (0.0, 0.0)
 
 
 def test_a_reference_has_two_parts_whatever_they_take_and_stops_in_time() -> None:
@@ -432,7 +434,7 @@ def test_a_reference_has_two_parts_whatever_they_take_and_stops_in_time() -> Non
         clock.now += 1.0
         return np.array([float(seed)])
 
-    for seconds, count in ((0.1, 2), (0.0, 2), (5.5, 5), (1e9, MOST_PARTS)):
+    for seconds, count in ((0.1, 2), (0.0, 2), (5.5, 5), (1e9, MAX_REFERENCE_PARTS)):
         parts = take_reference_parts(part, TimeBudget(seconds, clock), lambda: None, seed=0)
         assert len(parts) == count == len({float(one[0]) for one in parts})
 
@@ -441,16 +443,16 @@ def test_a_reference_has_two_parts_whatever_they_take_and_stops_in_time() -> Non
 
 
 def test_every_count_that_is_measured_is_one_that_its_sampler_takes() -> None:
-    from advsearch.scene.mitsuba_backend.variant import mitsuba
+    from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 
-    mi = mitsuba()
+    mi = import_mitsuba()
     for name in SAMPLERS:
         sampler = mi.load_dict({"type": name})
-        for count in COUNTS.get(name, (4, 16, 64, 256)):
+        for count in SAMPLE_COUNTS.get(name, (4, 16, 64, 256)):
             sampler.set_sample_count(count)
             assert sampler.sample_count() == count, name
         for wanted in (1, 5, 24, 65, 130):
-            count = next_count(name, wanted)
+            count = round_sample_count(name, wanted)
             sampler.set_sample_count(count)
             assert count >= wanted and sampler.sample_count() == count, name
 
@@ -461,11 +463,11 @@ def test_theory_and_counts_are_those_of_the_sampler() -> None:
 
     def said(pixel_sampler: str, quantity: str, estimator: str, family: str, loss: str = "linear") -> tuple[Any, int]:
         config = PrecisionConfig(object="mug", pixel_sampler=pixel_sampler, loss=loss, controls="environment.exposure")
-        job = Measurement(config, problem_from_config(config)[0], NullProgress())
+        job = QuantityMeasurer(config, problem_from_config(config)[0], NullProgress())
         point = point_at(4, 0.1).model_copy(
             update={"quantity": quantity, "estimator": estimator, "family": family, "control": "environment"}
         )
-        return job.or_steeper(point), job.round_up(point, 39)
+        return job.may_be_steeper(point), job.round_up(point, 39)
 
     assert said("multijitter", "picture", "independent", "none") == (False, 39)
     assert said("independent", "margin", "ldsampler", "none") == (True, 64)
@@ -494,15 +496,15 @@ def test_parts_of_a_control_with_other_estimators_have_names_of_their_own() -> N
 @pytest.mark.medium
 def test_an_adjoint_is_compared_with_a_reference_by_an_adjoint_that_differences_confirm() -> None:
     renderer = load_scene("mug").renderer({"texture": {"resolution": 8}}, resolution=24, denoise="none")
-    renderer = renderer.like(transfer="linear")
-    renderer.plan = renderer.plan.at_a_pixel()
+    renderer = renderer.copy_with(transfer="linear")
+    renderer.plan = renderer.plan.with_pixel_steps()
     (part,) = list_gradient_parts(renderer.plan.groups, linear=True)
-    bench = GradientBench(renderer, smooth_loss((24, 24)), renderer.start, part)
-    (row,) = bench.refer(TimeBudget(1.0), 0, lambda: None)
+    bench = GradientBench(renderer, make_smooth_loss((24, 24)), renderer.start, part)
+    (row,) = bench.compute_references(TimeBudget(1.0), 0, lambda: None)
     assert (row.reference, row.control, row.quantity) == ("adjoint", "texture", "gradient") and row.error < 0.5
     numbers = bench.measure(next(one for one in bench.settings if one.spp == 256), 1)["gradient"]
     assert numbers["cosine"] > 0.9 and numbers["error"] < 0.5 and numbers["wall_seconds"] > 0.0
-    assert bench.bias(0) is None
+    assert bench.check_bias(0) is None
 
 
 # ---- the command ----------------------------------------------------------------------------------------------------
@@ -527,7 +529,7 @@ def test_settings_go_through_yaml(tmp_path: Path) -> None:
     path = tmp_path / "run.yaml"
     path.write_text(config.to_yaml(), encoding="utf-8")
     assert PrecisionConfig.from_yaml(path) == config
-    shared = AttackConfig.of(config, norm="l2")
+    shared = AttackConfig.from_config(config, norm="l2")
     assert (shared.object, shared.controls, shared.objective, shared.norm) == ("mug", {"pose": {}}, None, "l2")
     assert (shared.steps, shared.seconds) == (None, None), "what only has the same name is not shared"
 
@@ -611,4 +613,4 @@ def test_a_part_that_is_measured_is_kept_and_not_measured_again(
 
 def test_a_report_without_points_has_no_figure() -> None:
     nothing: dict[str, Any] = {"points": [], "slopes": []}
-    assert precision_figures(PrecisionResult.model_construct(**nothing)) == {}
+    assert draw_figures(PrecisionResult.model_construct(**nothing)) == {}

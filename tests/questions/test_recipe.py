@@ -14,19 +14,19 @@ import pytest
 import advsearch
 from advsearch.attacks import make_policy
 from advsearch.cli.main import main
-from advsearch.engine.surface_light import refusal_of_surface_light
+from advsearch.engine.surface_light import find_surface_light_refusal
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.experiment import run_experiment
-from advsearch.questions.attack.carry_out import parts_of, problem_of_parts
+from advsearch.questions.attack.carry_out import load_parts, make_problem_with_warnings
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import FoundValue, SearchDistribution
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe import recipe as asked
-from advsearch.questions.recipe.carry_out import FIGURES, check_figures, files_of, make, read_options
-from advsearch.questions.recipe.description import Recipe, planned, read_recipe, recipe_names, titles
-from advsearch.questions.recipe.given import CuesOptions, all_triangles, fitting, predicted, triangle_of
-from advsearch.questions.recipe.rates import MadeFigure, Rows, Tally, frame_of
-from advsearch.questions.recipe.result import RecipeConfig, RecipeFigure, RecipeResult, told_once
+from advsearch.questions.recipe.carry_out import FIGURES, check_figures, draw_files, make_figures, read_figure_options
+from advsearch.questions.recipe.description import Recipe, list_recipes, plan_runs, read_recipe, titles
+from advsearch.questions.recipe.given import CuesOptions, count_predicted, find_triangle, list_triangles, shorten_to_fit
+from advsearch.questions.recipe.rates import ClusteredFraction, FigureContent, Rows, make_frame
+from advsearch.questions.recipe.result import RecipeConfig, RecipeFigure, RecipeResult, omit_repeated_sentences
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SurfaceMap
 from advsearch.runs.files import write_png
@@ -70,7 +70,7 @@ def tabled(given: Sequence[Answered], groups: dict[str, list[str]] | None = None
         for n, one in enumerate(given)
     ]
     units = {name: unit for one in given for name, unit in one.units.items()}
-    return frame_of(listed, groups or {}, units=units, **{"cores": 1, "surfaces": {}, **more})
+    return make_frame(listed, groups or {}, units=units, **{"cores": 1, "surfaces": {}, **more})
 
 
 def rows(counts: dict[str, tuple[int, int]], **more: float | str) -> list[Answered]:
@@ -89,9 +89,9 @@ def answered(values: dict[str, float | str], right: bool) -> Answered:
 
 def figure(
     described: dict[str, object], answered: Sequence[Answered], groups: dict[str, list[str]] | None = None
-) -> MadeFigure:
+) -> FigureContent:
     """The only figure of these rows."""
-    (made,) = make(tabled(answered, groups), *read_options(described, "here"))
+    (made,) = make_figures(tabled(answered, groups), *read_figure_options(described, "here"))
     return made
 
 
@@ -101,7 +101,7 @@ def answer(described: dict[str, object], answered: Sequence[Answered]) -> Recipe
     return RecipeFigure(figure="rates", title=made.title, text=list(made.text), columns=[], rows=[])
 
 
-def counts(made: MadeFigure) -> dict[Any, tuple[Any, Any]]:
+def counts(made: FigureContent) -> dict[Any, tuple[Any, Any]]:
     """What is counted, of how many, by the names before it."""
     names = made.columns.index("of") - 1
     return {row[0] if names == 1 else tuple(row[:names]): (row[names], row[names + 1]) for row in made.rows}
@@ -125,15 +125,15 @@ EXAMPLES: dict[str, dict[str, object]] = {
 # ---- what a file may say --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", recipe_names())
+@pytest.mark.parametrize("name", list_recipes())
 @pytest.mark.parametrize("quick", [False, True])
 def test_every_bundled_recipe_is_one_that_can_be_run_and_save(name: str, quick: bool) -> None:
     described = read_recipe(name)
-    runs = planned(described, RecipeConfig(recipe=name, quick=quick))
+    runs = plan_runs(described, RecipeConfig(recipe=name, quick=quick))
     assert runs and len({one.name for one in runs}) == len(runs)
     drawn = [one.config.seed for one in runs if described.parts[one.part].drawn_as is None]
     assert len(set(drawn)) == len(drawn) and set(drawn) == {one.config.seed for one in runs}
-    assert described.figures and all(read_options(one, name) for one in described.figures)
+    assert described.figures and all(read_figure_options(one, name) for one in described.figures)
     assert titles()[name] == described.title and described.title.endswith("?")
 
 
@@ -181,7 +181,7 @@ def test_what_no_command_takes_is_refused_before_anything_is_done(
 ) -> None:
     described = {"title": "a", "settings": {"object": "mug"}, "parts": {"a": {"command": "sweep"}}, **change}
     with pytest.raises(kind, match=message):
-        planned(Recipe(**described), RecipeConfig(recipe="mine", quick=True))
+        plan_runs(Recipe(**described), RecipeConfig(recipe="mine", quick=True))
 
 
 @pytest.mark.parametrize(
@@ -254,43 +254,43 @@ def test_a_figure_of_what_no_row_will_have_is_refused_before_anything_is_rendere
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("name", recipe_names())
+@pytest.mark.parametrize("name", list_recipes())
 def test_the_figures_of_every_bundled_recipe_name_columns_that_there_are(name: str) -> None:
     described, config = read_recipe(name), RecipeConfig(recipe=name, quick=True, object="mug")
-    check_figures(described, carrying_out.check_runs(planned(described, config)), name)
+    check_figures(described, carrying_out.check_runs(plan_runs(described, config)), name)
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("name", recipe_names())
+@pytest.mark.parametrize("name", list_recipes())
 def test_every_bundled_recipe_takes_an_environment_of_ones_own(tmp_path: Path, name: str) -> None:
     room = tmp_path / "room.exr"
     room.write_bytes((SCENES / "loft.exr").read_bytes())
-    runs = planned(read_recipe(name), RecipeConfig(recipe=name, quick=True, object="mug", environment=str(room)))
+    runs = plan_runs(read_recipe(name), RecipeConfig(recipe=name, quick=True, object="mug", environment=str(room)))
     assert runs and carrying_out.check_runs(runs).keys() == {one.part for one in runs}
 
 
-@pytest.mark.parametrize("name", recipe_names())
+@pytest.mark.parametrize("name", list_recipes())
 def test_every_bundled_recipe_takes_a_detector_or_says_why_not(name: str) -> None:
     described = read_recipe(name)
     config = RecipeConfig(recipe=name, object="mug", task="detection={overlap: 0.4}", label="cup")
-    runs = planned(described, config)
+    runs = plan_runs(described, config)
     assert runs and all(one.config.task == {"name": "detection", "overlap": 0.4} for one in runs)
     if name != "texture-shape":
-        carrying_out.check_described(described, config)
+        carrying_out.check_recipe(described, config)
         return
     with pytest.raises(InputError, match="task: texture-shape asks whether predictions are classes of the texture"):
-        carrying_out.check_described(described, config)
+        carrying_out.check_recipe(described, config)
 
 
 def test_the_recipe_for_viewpoints_searches_predicted_pictures_and_counts_rendered_ones() -> None:
     runs = {
         one.part: one.config
-        for one in planned(read_recipe("viewpoints"), RecipeConfig(recipe="viewpoints", object="mug"))
+        for one in plan_runs(read_recipe("viewpoints"), RecipeConfig(recipe="viewpoints", object="mug"))
     }
     search, drawn = runs["search"], [runs["all"], runs["worst"]]
     assert isinstance(search, AttackConfig) and search.steps is not None
-    problem, _ = problem_of_parts(parts_of(search))
-    assert refusal_of_surface_light(problem, search.steps, make_policy(search.policy_name), search.specialise) is None
+    problem, _ = make_problem_with_warnings(load_parts(search))
+    assert find_surface_light_refusal(problem, search.steps, make_policy(search.policy_name), search.specialise) is None
     assert [isinstance(one, SweepConfig) and one.specialise for one in drawn] == [False, False]
 
 
@@ -312,7 +312,7 @@ def test_what_is_asked_for_goes_over_the_recipe_and_labels_go_to_their_objects()
         recipe="mine", object="x/mug.obj,bowl", environment="kitchen,loft", model="m.pt2",
         label={"mug": "coffee mug,cup", "*": "bowl"}, seed=3,
     )  # fmt: skip
-    runs = planned(described, config)
+    runs = plan_runs(described, config)
     assert [(one.part, one.config.object, one.config.environment, one.config.label) for one in runs] == [
         ("a", "x/mug.obj", "noon", "coffee mug,cup"),
         ("a", "bowl", "noon", "bowl"),
@@ -429,7 +429,7 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
     }
     found = SearchDistribution.of({"mean": searched, "deviation": [0.1, 0.05, 2.0, 0.1]})
     ranges = {name: FoundValue.of(value) for name, value in searched.items()}
-    drawn = carrying_out.around(SweepConfig(object="mug"), found, ranges)
+    drawn = carrying_out.sample_around(SweepConfig(object="mug"), found, ranges)
     assert isinstance(drawn, SweepConfig) and drawn.sampler == "random"
     camera: Any = drawn.controls["camera"]
     low, high = camera["elevation"]
@@ -445,12 +445,16 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
 
 def test_intervals_are_over_drives_where_frames_of_one_share_a_draw() -> None:
     frames = [replace(row, unit=f"drive {n // 10}") for n, row in enumerate(rows({"noon": (40, 100)}))]
-    alone, together = (Tally.over("noon", tabled(some)) for some in (rows({"noon": (40, 100)}), frames))
+    alone, together = (
+        ClusteredFraction.from_rows("noon", tabled(some)) for some in (rows({"noon": (40, 100)}), frames)
+    )
     own, others = alone.interval(), together.interval()
-    assert own is not None and others is not None and alone.cells[:3] == together.cells[:3] == [40, 100, 0.4]
+    assert (
+        own is not None and others is not None and alone.table_cells[:3] == together.table_cells[:3] == [40, 100, 0.4]
+    )
     assert own == clopper_pearson(40, 100) and others[0] < own[0] and others[1] > own[1]
     (row,) = figure({"figure": "rates", "by": "environment"}, frames).rows
-    assert row == ["noon", *together.cells]
+    assert row == ["noon", *together.table_cells]
 
 
 def test_a_difference_is_claimed_where_intervals_are_apart_and_not_where_they_overlap() -> None:
@@ -524,7 +528,7 @@ def told_by(answer: Any, shapes: int, textures: int, seed: int) -> str:
         for _ in range(8)
     ]
     made = figure({"figure": "cues"}, answered)
-    assert sum(given for given, _, _ in predicted(tabled(answered), CuesOptions())) == len(answered)
+    assert sum(given for given, _, _ in count_predicted(tabled(answered), CuesOptions())) == len(answered)
     (text,) = [one for one in made.text if "most frequent prediction about the same object" in one]
     return next(
         kind for kind in ("by shape than by texture", "by texture than by shape", "no difference") if kind in text
@@ -554,10 +558,10 @@ def test_one_object_does_not_tell_shape_from_texture() -> None:
 
 def test_a_mixture_lies_in_its_triangle() -> None:
     for side in (1, 3, 5):
-        corners = all_triangles(side)
+        corners = list_triangles(side)
         assert len(corners) == side * side
         for mixture in [*np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), 200), *np.eye(3)]:
-            three = np.array(corners[triangle_of(mixture, side)])
+            three = np.array(corners[find_triangle(mixture, side)])
             weights = np.linalg.solve(three.T, mixture)
             assert weights.min() > -1e-9 and weights.sum() == pytest.approx(1.0)
 
@@ -593,7 +597,7 @@ def test_where_a_mixture_has_one_prediction_it_is_shown_how_far_that_leads() -> 
     )
     assert "The difference is shown" in made.text[1]
     assert made.text[2] == "No picture was drawn in 1 of 16 parts of the diagram, which are hatched."
-    assert files_of(made)["png"]
+    assert draw_files(made)["png"]
     same = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=3.0) for one in answered])
     assert "No difference is shown" in same.text[1]
     unknown = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=None) for one in answered])
@@ -606,7 +610,10 @@ def test_two_figures_that_say_the_same_say_it_once() -> None:
     one, two = (answer({"figure": "rates", "by": "environment"}, rows({"noon": (at, 20)})) for at in (8, 9))
     same = ["It says the same as the figure before it."]
     before = ["It says what figures before it say."]
-    assert told_once([one, one, two, one]) == [one.text, same, two.text, before] and told_once([]) == []
+    assert (
+        omit_repeated_sentences([one, one, two, one]) == [one.text, same, two.text, before]
+        and omit_repeated_sentences([]) == []
+    )
 
 
 def test_curves_along_two_parameters_say_once_what_holds_for_both() -> None:
@@ -619,7 +626,11 @@ def test_curves_along_two_parameters_say_once_what_holds_for_both() -> None:
         for by in ("yaw", "zoom")
     )
     (both,) = [text for text in one.text if text.startswith("Over all, the lowest share is that of")]
-    assert both in two.text and both in told_once([one, two])[0] and both not in told_once([one, two])[1]
+    assert (
+        both in two.text
+        and both in omit_repeated_sentences([one, two])[0]
+        and both not in omit_repeated_sentences([one, two])[1]
+    )
 
 
 def test_values_that_come_round_are_counted_by_the_shorter_way() -> None:
@@ -670,11 +681,11 @@ def test_the_rate_of_workers_is_that_after_the_first_quarter_and_their_gain_is_o
 
 def test_a_quick_recipe_is_without_the_parts_that_it_leaves_out() -> None:
     described = read_recipe("scaling")
-    runs = planned(described, RecipeConfig(recipe="scaling", quick=True, object="mug"))
+    runs = plan_runs(described, RecipeConfig(recipe="scaling", quick=True, object="mug"))
     assert [one.part for one in runs] == ["workers-1", "workers-2"] and runs[0].config.seed == runs[1].config.seed
-    assert len(planned(described, RecipeConfig(recipe="scaling", object="mug"))) == 4
+    assert len(plan_runs(described, RecipeConfig(recipe="scaling", object="mug"))) == 4
     with pytest.raises(UnknownNameError, match="unknown part 'b'"):
-        Recipe(title="a", parts={"a": {"command": "sweep"}}, quick={"without": ["b"]}).made_quick()
+        Recipe(title="a", parts={"a": {"command": "sweep"}}, quick={"without": ["b"]}).apply_quick()
 
 
 def test_without_photographs_nothing_is_said_of_reality_and_they_are_in_no_figure_that_does_not_ask_for_them() -> None:
@@ -712,11 +723,11 @@ def test_the_mean_corruption_error_is_relative_to_the_first_model() -> None:
 def test_each_model_has_a_figure_unless_it_tells_them_apart() -> None:
     answered = [*rows({"noon": (2, 6)}, model="one"), *rows({"noon": (5, 6)}, model="two")]
     described = {"figure": "rates", "by": "environment", "title": "Hard"}
-    found = list(make(tabled(answered), *read_options(described, "here")))
+    found = list(make_figures(tabled(answered), *read_figure_options(described, "here")))
     assert [made.title for made in found] == ["Hard: one", "Hard: two"]
     assert [made.text[0][:29] for made in found] == ["noon: right in 2 of 6 (33 %, ", "noon: right in 5 of 6 (83 %, "]
     for told in ({"figure": "rates", "by": "model"}, {"figure": "rates", "by": "environment", "series": "model"}):
-        assert len(list(make(tabled(answered), *read_options(told, "here")))) == 1
+        assert len(list(make_figures(tabled(answered), *read_figure_options(told, "here")))) == 1
 
 
 def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
@@ -734,10 +745,10 @@ def test_every_figure_is_drawn_and_is_a_table(name: str, tmp_path: Path) -> None
     write_png(tmp_path / "parts" / "views-00-mug" / "images" / "surface.png", np.zeros((8, 8, 3)))
     own = {"agreement": PICTURED, "scaling": TIMED}
     table = tabled(own.get(name, EXAMPLE_ROWS), {"round": ["mug"]}, surfaces={"views-00-mug": SURFACE}, folder=tmp_path)
-    (made,) = make(table, *read_options(EXAMPLES[name], "here"))
+    (made,) = make_figures(table, *read_figure_options(EXAMPLES[name], "here"))
     assert made.title and made.text and all(one.endswith(".") for one in made.text)
     assert made.rows and all(len(row) == len(made.columns) for row in made.rows)
-    assert files_of(made)["png"].startswith(b"\x89PNG")
+    assert draw_files(made)["png"].startswith(b"\x89PNG")
 
 
 def test_every_kind_of_figure_has_an_example() -> None:
@@ -792,4 +803,4 @@ PICTURED = [
     [(0.35, "piggy bank, penny bank"), (0.2, "piggy bank"), (0.1, "piggy b…"), (0.06, "pigg…"), (0.04, "")],
 )
 def test_a_bar_shows_as_much_of_a_name_as_there_is_room_for(share: float, shown: str) -> None:
-    assert fitting("piggy bank, penny bank", share) == shown
+    assert shorten_to_fit("piggy bank, penny bank", share) == shown

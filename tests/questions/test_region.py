@@ -27,7 +27,7 @@ SMALL: dict[str, Any] = {
 def coarse() -> Iterator[None]:
     """Few texels, rays and pictures; light that always pays and is good enough."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(texels, "GROUND", 32)
+        patched.setattr(texels, "GROUND_TEXELS", 32)
         for module, name, value in (
             (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (acceptance, "CHECK_SPP", 4),
             (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (boxes, "MAX_PROBED", 20),
@@ -55,7 +55,7 @@ def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Pa
     assert result.samples == 8 and checked % 8 == 0 and checked >= 8
     assert predicted and found.count(("map", True, 4)) == 9 and len(found) == predicted + checked + 9
     assert result.renders["products"] == predicted + 9
-    compared = 3 * acceptance.FIRST
+    compared = 3 * acceptance.N_FIRST_VIEWS
     assert result.renders["verification"] == growing.CENTRE_TRIALS + checked + compared
 
 

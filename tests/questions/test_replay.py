@@ -21,7 +21,7 @@ from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.replay import replay
-from advsearch.questions.replay.result import ReplayConfig, ReplayResult, replay_text
+from advsearch.questions.replay.result import ReplayConfig, ReplayResult, summarize_replay
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_configuration, read_result, write_configuration
@@ -123,8 +123,8 @@ def test_what_changes_only_after_rendering_renders_nothing(attacked: Path, tmp_p
 @pytest.mark.parametrize("curve", ["srgb", "gamma", "reinhard"])
 def test_a_shared_radiance_gives_the_same_picture(attacked: Path, tmp_path: Path, curve: str) -> None:
     problem, _ = problem_from_config(AttackConfig.from_yaml(attacked / "run.yaml"))
-    changed = replace(problem, renderer=problem.renderer.like(transfer=curve))
-    pair = [RetrialCondition(name, one, 4, name, light="own") for name, one in (("a", problem), ("b", changed))]
+    changed = replace(problem, renderer=problem.renderer.copy_with(transfer=curve))
+    pair = [RetrialCondition(name, one, 4, name, radiance_key="own") for name, one in (("a", problem), ("b", changed))]
     u = torch.from_numpy(read_configuration(attacked))
     with RunDirectory.create(tmp_path / "run") as run:
         retrials = Retrials(pair, run, NullProgress(), trials=6, seed=0)
@@ -186,11 +186,11 @@ def test_nothing_is_counted_of_conditions_that_were_not_rendered() -> None:
     same = {**samples.REPLAY["table"][0], "way": "as verified"}
     not_done = samples.REPLAY["table"][1]
     alone = ReplayResult.of({**samples.REPLAY, "table": [same, not_done]})
-    assert replay_text(alone) == "As verified, the adversarial scene holds; no change was rendered."
+    assert summarize_replay(alone) == "As verified, the adversarial scene holds; no change was rendered."
     none = ReplayResult.of({**samples.REPLAY, "table": [not_done, not_done]})
-    assert replay_text(none) == "Nothing was rendered again." and none.brief == ""
+    assert summarize_replay(none) == "Nothing was rendered again." and none.brief == ""
     changed = ReplayResult.of({**samples.REPLAY, "table": [not_done, samples.REPLAY["table"][0]]})
-    assert "scene was not rendered; changed, it holds under 1 of 1 conditions" in replay_text(changed)
+    assert "scene was not rendered; changed, it holds under 1 of 1 conditions" in summarize_replay(changed)
 
 
 def test_an_unknown_way_is_refused() -> None:

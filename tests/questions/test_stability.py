@@ -16,7 +16,7 @@ from advsearch.cli.main import main
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.stability import scenes as suite
 from advsearch.questions.stability.result import (
-    CASES,
+    ALL_CASES,
     FELL_SHORT,
     OK,
     Case,
@@ -24,10 +24,10 @@ from advsearch.questions.stability.result import (
     Outcome,
     StabilityConfig,
     StabilityResult,
-    check,
-    holds,
+    check_condition,
+    check_range,
 )
-from advsearch.questions.stability.scenes import chosen, condition_number, hessian
+from advsearch.questions.stability.scenes import condition_number, estimate_hessian, select_cases
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.summary import read_result
 from covering import only
@@ -44,8 +44,8 @@ WANTED = {
 }
 """How the names of the extremes begin that the suite has to have."""
 
-GROUPS = tuple(dict.fromkeys(case.group for case in CASES))
-CHEAP = [case for case in CASES if not case.slow]
+GROUPS = tuple(dict.fromkeys(case.group for case in ALL_CASES))
+CHEAP = [case for case in ALL_CASES if not case.slow]
 FEW = [case for group in GROUPS for case in [case for case in CHEAP if case.group == group][::3]]
 """Of each group the first, and of every three more one; the other cheap ones are among the slow tests."""
 
@@ -56,14 +56,14 @@ FEW = [case for group in GROUPS for case in [case for case in CHEAP if case.grou
 def test_every_extreme_has_a_case() -> None:
     assert {*WANTED} == {*GROUPS}
     for group, beginnings in WANTED.items():
-        names = [case.name for case in CASES if case.group == group]
+        names = [case.name for case in ALL_CASES if case.group == group]
         for one in beginnings.split():
             assert any(name.startswith(one) for name in names), f"{group}: {one}"
 
 
 def test_cases_are_complete_and_have_names_of_their_own() -> None:
-    assert len({case.name for case in CASES}) == len(CASES)
-    for case in CASES:
+    assert len({case.name for case in ALL_CASES}) == len(ALL_CASES)
+    for case in ALL_CASES:
         assert case.holds.endswith("."), case.name
 
 
@@ -82,7 +82,7 @@ def test_a_cheap_case_holds(case: Case) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [case for case in CASES if case.slow], ids=lambda case: case.name)
+@pytest.mark.parametrize("case", [case for case in ALL_CASES if case.slow], ids=lambda case: case.name)
 def test_a_case_holds(case: Case) -> None:
     row = case.run()
     assert row.status == OK, row.decides
@@ -94,12 +94,12 @@ def test_a_case_holds(case: Case) -> None:
 @pytest.mark.parametrize(
     ("number", "ok", "text"),
     [
-        (check("x", 1.0, most=2.0), True, "x: 1 (expected at most 2)"),
-        (check("x", 3.0, most=2.0), False, "x: 3 (expected at most 2)"),
-        (check("x", 3.0, 1.0, 2.0), False, "x: 3 (expected at least 1 and at most 2)"),
-        (check("x", math.nan, most=2.0), False, "x: nan (expected at most 2)"),
-        (check("x", math.nan), False, "x: nan"),
-        (holds("x", False), False, "x: 0 (expected exactly 1)"),
+        (check_range("x", 1.0, most=2.0), True, "x: 1 (expected at most 2)"),
+        (check_range("x", 3.0, most=2.0), False, "x: 3 (expected at most 2)"),
+        (check_range("x", 3.0, 1.0, 2.0), False, "x: 3 (expected at least 1 and at most 2)"),
+        (check_range("x", math.nan, most=2.0), False, "x: nan (expected at most 2)"),
+        (check_range("x", math.nan), False, "x: nan"),
+        (check_condition("x", False), False, "x: 0 (expected exactly 1)"),
     ],
 )
 def test_a_check_says_what_it_wanted(number: Check, ok: bool, text: str) -> None:
@@ -116,7 +116,7 @@ def made(outcome: Outcome | Exception, name: str = "made") -> Case:
 
 
 def test_a_row_has_what_the_design_lists() -> None:
-    numbers = [check("a", 1.0, most=2.0), check("b", 5.0, most=2.0)]
+    numbers = [check_range("a", 1.0, most=2.0), check_range("b", 5.0, most=2.0)]
     outcome = Outcome(numbers, relative_error=0.25, ending="stalled", measured={"c": 3.0})
     row: Any = made(outcome).run().to_dict()
     wanted = {"case": "made", "group": "noise", "finite": True, "relative_error": 0.25, "ending": "stalled"}
@@ -126,7 +126,7 @@ def test_a_row_has_what_the_design_lists() -> None:
 
 
 def test_what_is_not_finite_falls_short_whatever_the_checks_say() -> None:
-    row = made(Outcome([check("a", 1.0, most=2.0)], finite=False)).run()
+    row = made(Outcome([check_range("a", 1.0, most=2.0)], finite=False)).run()
     assert (row.status, row.decides) == (FELL_SHORT, "NaN or infinite values")
 
 
@@ -150,9 +150,9 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def two_cases(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    good = made(Outcome([check("a", 1.0, most=2.0)], relative_error=0.02, ending="found"), "good")
-    bad = replace(made(Outcome([check("a", 3.0, most=2.0)]), "bad"), group="stiff")
-    monkeypatch.setattr(suite, "CASES", (good, bad))
+    good = made(Outcome([check_range("a", 1.0, most=2.0)], relative_error=0.02, ending="found"), "good")
+    bad = replace(made(Outcome([check_range("a", 3.0, most=2.0)]), "bad"), group="stiff")
+    monkeypatch.setattr(suite, "ALL_CASES", (good, bad))
     yield
 
 
@@ -175,15 +175,15 @@ def test_the_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_command_lists_its_cases_without_running_them(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "cases", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["cases"] == [case.name for case in CASES]
+    assert json.loads(capsys.readouterr().out)["cases"] == [case.name for case in ALL_CASES]
 
 
 def test_unknown_cases_and_groups_are_refused() -> None:
     with pytest.raises(UnknownNameError, match=r"unknown case 'gimbal-angle'\. Did you mean 'gimbal-angles'"):
-        chosen(["gimbal-angle"])
+        select_cases(["gimbal-angle"])
     with pytest.raises(UnknownNameError, match=r"unknown group 'stif'\. Did you mean 'stiff'"):
-        chosen([], ["stif"])
-    assert {case.group for case in chosen(["gimbal-angles"], ["stiff"])} == {"geometry", "stiff"}
+        select_cases([], ["stif"])
+    assert {case.group for case in select_cases(["gimbal-angles"], ["stiff"])} == {"geometry", "stiff"}
 
 
 def uncalled() -> Outcome:
@@ -195,7 +195,7 @@ def test_a_stopped_suite_goes_on_with_the_case_that_it_was_at(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`show` and `runs` know it, and the rows end up those of a suite that nobody stopped."""
-    good, bad = chosen()
+    good, bad = select_cases()
     assert main(["stability", "--quiet", "--json", "--run", "whole"]) == 3
     whole = json.loads(capsys.readouterr().out)["rows"]
     assert main(["stability", "--quiet", "--seconds", "1e-9", "--run", "short"]) == 0
@@ -203,7 +203,7 @@ def test_a_stopped_suite_goes_on_with_the_case_that_it_was_at(
     assert (first.ending, [row.case for row in first.rows], first.not_run) == ("out of time", ["good"], ["bad"])
     capsys.readouterr()
     assert main(["show", "short"]) == 0 and "Go on with: advsearch resume short" in capsys.readouterr().out
-    monkeypatch.setattr(suite, "CASES", (replace(good, find=uncalled), bad))
+    monkeypatch.setattr(suite, "ALL_CASES", (replace(good, measure=uncalled), bad))
     assert main(["resume", "short", "--quiet"]) == 3
     last = kept("short")
     assert (last.ending, last.not_run) == ("done", [])
@@ -245,8 +245,8 @@ def test_seconds_and_ctrl_c_end_the_suite_and_say_what_was_not_run(
     def interrupted() -> Outcome:
         raise KeyboardInterrupt
 
-    good, bad = chosen()
-    monkeypatch.setattr(suite, "CASES", (good, replace(bad, find=interrupted)))
+    good, bad = select_cases()
+    monkeypatch.setattr(suite, "ALL_CASES", (good, replace(bad, measure=interrupted)))
     assert main(["stability", "--json"]) == 130
     told = capsys.readouterr()
     assert json.loads(told.out)["not_run"] == ["bad"] and len(json.loads(told.out)["rows"]) == 1
@@ -260,7 +260,7 @@ def test_seconds_and_ctrl_c_end_the_suite_and_say_what_was_not_run(
 
 def test_the_condition_number_of_a_quadratic_is_estimated() -> None:
     weights = torch.tensor([1e6, 1.0]).double()
-    second = hessian(
+    second = estimate_hessian(
         lambda u: -0.5 * float(weights @ (u - 0.5).square()),
         torch.full((2,), 0.3).double(),
         torch.eye(2).double(),
@@ -271,5 +271,7 @@ def test_the_condition_number_of_a_quadratic_is_estimated() -> None:
 
 
 def test_mixed_second_derivatives_are_estimated() -> None:
-    second = hessian(lambda u: float(u[0] * u[1]), torch.full((2,), 0.3).double(), torch.eye(2).double(), [0.1, 0.2])
+    second = estimate_hessian(
+        lambda u: float(u[0] * u[1]), torch.full((2,), 0.3).double(), torch.eye(2).double(), [0.1, 0.2]
+    )
     assert torch.allclose(second, torch.tensor([[0.0, 1.0], [1.0, 0.0]]).double(), atol=1e-12)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from advsearch.errors import InputError
-from advsearch.questions.sweep.display import distance_of, distance_sentence, seen_from
-from advsearch.questions.sweep.page import SweepSource, sweep_page_html
+from advsearch.questions.sweep.display import compute_detection_distance, distance_sentence, find_detection_distance
+from advsearch.questions.sweep.page import SweepSource, make_sweep_page
 from advsearch.questions.sweep.summary import AxisRow
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.statistics.monotone import find_dips
@@ -30,25 +30,25 @@ def rows(correct: list[int], of: int = 20, unit: str = "metres") -> list[AxisRow
 
 
 def test_the_distance_lies_where_half_of_the_pictures_show_it() -> None:
-    found = seen_from(rows([20, 20, 15, 5, 0])[::-1])
+    found = compute_detection_distance(rows([20, 20, 15, 5, 0])[::-1])
     assert found.distances == DISTANCES
     assert found.distance == pytest.approx(math.sqrt(20.0 * 40.0))
-    assert (found.low, found.high) == (10.0, 80.0)
+    assert (found.lower, found.upper) == (10.0, 80.0)
     assert distance_sentence(found) == "Seen from 28.3 m in half of the pictures, 10 to 80 m with 95 % confidence."
 
 
 def test_a_share_that_rises_with_the_distance_is_pooled() -> None:
-    found = seen_from(rows([20, 10, 18, 2, 0]))
+    found = compute_detection_distance(rows([20, 10, 18, 2, 0]))
     pooled = 28 / 40
     part = (pooled - 0.5) / (pooled - 0.1)
     assert found.distance == pytest.approx(20.0 * 2.0**part)
 
 
 def test_a_range_with_a_dip_has_no_one_distance() -> None:
-    found = seen_from(rows([7, 20, 20, 4, 0]))
-    (dip,) = [one for one in found.dips if one.is_shown]
-    assert (dip.distance, dip.seen, dip.until, dip.beyond) == (5.0, (7, 20), 20.0, (40, 40))
-    assert dip.p < 1e-6 and not found.is_monotone
+    found = compute_detection_distance(rows([7, 20, 20, 4, 0]))
+    (dip,) = [one for one in found.dips if one.is_significant]
+    assert (dip.distance, dip.counts, dip.until, dip.counts_beyond) == (5.0, (7, 20), 20.0, (40, 40))
+    assert dip.p_value < 1e-6 and not found.is_monotone
     assert found.distance == pytest.approx(20.0 * 2.0 ** (0.5 / 0.8)), "beyond the dip nothing is pooled with it"
     said = distance_sentence(found)
     assert said.startswith("No one distance from which on it is seen: right in 7 of 20 at 5 m, 40 of 40 beyond it")
@@ -56,21 +56,21 @@ def test_a_range_with_a_dip_has_no_one_distance() -> None:
 
 
 def test_a_rise_beyond_the_estimate_is_told() -> None:
-    found = seen_from(rows([2, 1, 2, 0, 0], 4))
+    found = compute_detection_distance(rows([2, 1, 2, 0, 0], 4))
     said = distance_sentence(found)
     assert said.startswith("Seen from 5 m in half of the pictures")
     assert "right less often: in 1 of 4 at 10 m, 2 of 4 beyond it up to 20 m" in said and "may be chance" in said
 
 
 def test_a_dip_that_chance_explains_is_told_beside_the_estimate() -> None:
-    found = seen_from(rows([3, 5, 6, 1, 0], 8))
+    found = compute_detection_distance(rows([3, 5, 6, 1, 0], 8))
     assert found.is_monotone
     said = distance_sentence(found)
     assert said.startswith("Seen from 22.7 m in half of the pictures")
     assert (
         "Nearer it is right less often: in 3 of 8 at 5 m, 11 of 16 beyond it up to 20 m (p = 1), which may be" in said
     )
-    everywhere = distance_sentence(seen_from(rows([3, 6, 6, 5, 5], 8)))
+    everywhere = distance_sentence(compute_detection_distance(rows([3, 6, 6, 5, 5], 8)))
     assert everywhere.startswith("Seen in at least half of the pictures up to the farthest distance, 80 m")
     assert "in 3 of 8 at 5 m" in everywhere
 
@@ -82,7 +82,7 @@ def test_a_falling_curve_has_a_shown_dip_in_one_of_twenty_at_most(shares: tuple[
     tables, alarms = 300, 0
     for _ in range(tables):
         right = rng.binomial(of, shares)
-        alarms += any(dip.is_shown for dip in find_dips(range(1, 9), right, np.full(8, of)))
+        alarms += any(dip.is_significant for dip in find_dips(range(1, 9), right, np.full(8, of)))
     assert alarms <= 0.05 * tables
 
 
@@ -92,11 +92,11 @@ def test_loose_boxes_are_no_misses() -> None:
         row.model_copy(update={"outcomes": {"loose": loose.get(float(row.value), 0), "missed": 2}})  # type: ignore[arg-type]
         for row in rows([8, 20, 15, 5, 0])
     ]
-    found = seen_from(listed)
-    assert found.loose == (12, 0, 3, 0, 0)
+    found = compute_detection_distance(listed)
+    assert found.loose_counts == (12, 0, 3, 0, 0)
     said = "Not counted as seen, but not missed either, are loose boxes: 12 of 20 at 5 m, 3 of 20 at 20 m."
     assert distance_sentence(found).endswith(said)
-    assert "loose" not in distance_sentence(seen_from(rows([8, 20, 15, 5, 0])))
+    assert "loose" not in distance_sentence(compute_detection_distance(rows([8, 20, 15, 5, 0])))
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_loose_boxes_are_no_misses() -> None:
     ],
 )
 def test_what_the_pictures_do_not_bound_is_left_open(correct: list[int], of: int, said: str) -> None:
-    assert distance_sentence(seen_from(rows(correct, of))).startswith(said)
+    assert distance_sentence(compute_detection_distance(rows(correct, of))).startswith(said)
 
 
 def test_the_interval_holds_as_often_as_it_says() -> None:
@@ -123,24 +123,24 @@ def test_the_interval_holds_as_often_as_it_says() -> None:
     held = 0
     for _ in range(200):
         shares = [1.0 / (1.0 + (at / true) ** 4) for at in DISTANCES]
-        found = seen_from(rows([int(rng.binomial(20, share)) for share in shares]))
-        held += (found.low or 0.0) <= true <= (found.high or math.inf)
+        found = compute_detection_distance(rows([int(rng.binomial(20, share)) for share in shares]))
+        held += (found.lower or 0.0) <= true <= (found.upper or math.inf)
     assert held >= 190
 
 
 def test_only_a_detector_and_several_distances_tell() -> None:
     told: dict[str, Any] = {"task": "detection", "axes": rows([20, 20, 15, 5, 0])}
-    assert distance_of(sweep(**told)) is not None
-    assert distance_of(sweep(**{**told, "task": "classification"})) is None
-    assert distance_of(sweep(**{**told, "model": "a.pt2, b.pt2"})) is None
-    assert distance_of(sweep(**{**told, "axes": rows([20, 20, 15, 5, 0])[:1]})) is None
+    assert find_detection_distance(sweep(**told)) is not None
+    assert find_detection_distance(sweep(**{**told, "task": "classification"})) is None
+    assert find_detection_distance(sweep(**{**told, "model": "a.pt2, b.pt2"})) is None
+    assert find_detection_distance(sweep(**{**told, "axes": rows([20, 20, 15, 5, 0])[:1]})) is None
     with pytest.raises(InputError, match="expected at least two distances, got 1"):
-        seen_from(rows([20, 20, 15, 5, 0])[:1])
+        compute_detection_distance(rows([20, 20, 15, 5, 0])[:1])
 
 
 def test_the_page_of_a_sweep_has_the_curve(tmp_path: Any) -> None:
     run = make_sweep(tmp_path / "s")
     told = sweep(task="detection", axes=rows([20, 20, 15, 5, 0]))
-    page = sweep_page_html([(run, told)], [SweepSource("s", None)])
+    page = make_sweep_page([(run, told)], [SweepSource("s", None)])
     assert re.search(r"<h2>How far away it is seen</h2>.*<p class=\"soft\">Seen from 28.3 m", page, re.DOTALL)
     assert page.count("<svg") >= 2

@@ -12,12 +12,12 @@ import pytest
 from advsearch.options import OUT_OF_VIEW, Outcome
 from advsearch.questions.attack.outcome import name_objective
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.wording import attack_verdict, remarks
+from advsearch.questions.attack.wording import attack_verdict, make_remarks
 from advsearch.questions.explain.result import ExplainResult
 from advsearch.questions.harden.result import HardenResult
-from advsearch.questions.sweep.page import sweep_verdict
-from advsearch.questions.sweep.result import OUTCOMES, Predictions, SweptAxis
-from advsearch.questions.test.result import FAILED, search_verdict, share_reason, tried_reason
+from advsearch.questions.sweep.page import verdict_text
+from advsearch.questions.sweep.result import OUTCOMES, Predictions, TableAxis
+from advsearch.questions.test.result import FAILED, describe_fraction, describe_trials, evaluate_search
 from advsearch.report.views import shown
 from advsearch.report.wording import wanted
 from advsearch.rules import count_wrong_outcomes
@@ -66,14 +66,14 @@ def test_an_attack_says_that_a_loose_box_is_no_miss() -> None:
 def test_a_clean_scene_that_fails_says_how() -> None:
     control = {"correct": 3, "trials": 8, "rate": 0.375, "interval": [0.1, 0.8], "outcomes": COUNTS}
     summary = attack(task="detection", clean={**cast(Any, attack().to_dict()["clean"]), "control": control})
-    assert f"The clean scene itself fails 5 of its 8 trials ({SAID})." in remarks(summary)
+    assert f"The clean scene itself fails 5 of its 8 trials ({SAID})." in make_remarks(summary)
 
 
 def test_a_sweep_says_how_the_others_fail() -> None:
     summary = sweep(task="detection", configurations=12, correct=7, accuracy=7 / 12, outcomes=COUNTS)
-    assert f"of the others, {SAID}." in sweep_verdict(summary)
+    assert f"of the others, {SAID}." in verdict_text(summary)
     assert f"of the others, {SAID}." in shown(summary).said
-    assert "of the others" not in sweep_verdict(sweep(task="detection"))
+    assert "of the others" not in verdict_text(sweep(task="detection"))
 
 
 def test_rows_of_a_sweep_are_counted_by_outcome() -> None:
@@ -84,10 +84,10 @@ def test_rows_of_a_sweep_are_counted_by_outcome() -> None:
     predictions.add(3, judged(False, "cup in a loose box", Outcome.LOOSE))
     predictions.add(4, judged(True, OUT_OF_VIEW, Outcome.PHANTOM))
     predictions.add(5, judged(True, OUT_OF_VIEW, None))
-    assert predictions.phantoms_out_of_view == 1 and predictions.hidden.sum() == 2
-    numbers = np.flatnonzero(predictions.counted)
-    axis = SweptAxis("camera.distance", "metres", [5.0, 9.0], np.array([0, 0, 1, 1]))
-    near, far = axis.rows(predictions.right[numbers], numbers, predictions.outcome[numbers])
+    assert predictions.n_phantoms_out_of_view == 1 and predictions.is_hidden.sum() == 2
+    numbers = np.flatnonzero(predictions.is_counted)
+    axis = TableAxis("camera.distance", "metres", [5.0, 9.0], np.array([0, 0, 1, 1]))
+    near, far = axis.make_rows(predictions.is_right[numbers], numbers, predictions.outcome[numbers])
     assert near.outcomes == {"missed": 1} and far.outcomes == {"loose": 2}
     assert OUTCOMES[predictions.outcome[0]] is Outcome.FOUND
 
@@ -108,12 +108,12 @@ def test_a_frame_of_rows_has_the_outcome() -> None:
 
 def test_claims_say_how_a_detector_fails() -> None:
     found = attack(task="detection", ending="found", verified=rated(labels={"no cup": 20}, outcomes={"missed": 20}))
-    verdict, reason, _ = search_verdict(found, AttackConfig(object="mug"))
+    verdict, reason, _ = evaluate_search(found, AttackConfig(object="mug"))
     assert verdict == FAILED and reason.endswith(": 20 missed") and "a no cup" not in reason
     interval = clopper_pearson(0, 8)
-    reason = tried_reason(FAILED, (0, 8, 0), "no cup", interval, over=False, outcomes="8 missed")
+    reason = describe_trials(FAILED, (0, 8, 0), "no cup", interval, over=False, outcomes="8 missed")
     assert reason.endswith(": 8 missed")
-    assert SAID in share_reason("right", FAILED, 7, 12, (0.2, 0.8), "most wrong where it says no cup", SAID)
+    assert SAID in describe_fraction("right", FAILED, 7, 12, (0.2, 0.8), "most wrong where it says no cup", SAID)
 
 
 def test_rules_and_hardening_say_it_too() -> None:
@@ -128,5 +128,5 @@ def test_rules_and_hardening_say_it_too() -> None:
 
 @pytest.mark.parametrize("outcomes", [{"loose": 1, "unknown": 4}, {}])
 def test_an_unknown_outcome_of_a_file_is_passed_over(outcomes: dict[str, int]) -> None:
-    said = sweep_verdict(sweep(task="detection", outcomes=outcomes))
+    said = verdict_text(sweep(task="detection", outcomes=outcomes))
     assert bool(re.search("1 in a loose box", said)) is bool(outcomes) and "unknown" not in said

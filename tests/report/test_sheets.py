@@ -14,7 +14,7 @@ import pytest
 from PIL import ImageCms
 
 import advsearch
-from advsearch.api.export import printable
+from advsearch.api.export import make_printable_pieces
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError
 from advsearch.report.sheets import MARGIN, PAPERS, Piece, pages_of, write_sheets
@@ -140,12 +140,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.medium
 def test_a_texture_is_printed_in_pieces_of_their_real_size(runs: dict[str, Path]) -> None:
-    pieces = printable(runs["texture"], 95.0)
+    pieces = make_printable_pieces(runs["texture"], 95.0)
     wall = pieces[0]
     vertices = advsearch.load_scene("mug").description.object.mesh.vertices
     rim = 95.0 * float(np.ptp(vertices[:, 0]))  # the handle points along y
     assert 0.92 * rim < wall.size[0] / math.pi < rim  # the mug narrows downwards
-    twice = printable(runs["texture"], 190.0)[0]
+    twice = make_printable_pieces(runs["texture"], 190.0)[0]
     assert twice.size == pytest.approx([2 * side for side in wall.size], rel=1e-6)
     texture = to_8bit(read_png(runs["texture"] / "artifacts" / "texture.png"))
     known = {tuple(colour) for colour in texture.reshape(-1, 3)}
@@ -157,7 +157,7 @@ def test_a_texture_is_printed_in_pieces_of_their_real_size(runs: dict[str, Path]
 
 
 def test_a_patch_is_printed_at_its_share_of_the_object(runs: dict[str, Path]) -> None:
-    (patch,) = printable(runs["patch"], 95.0)
+    (patch,) = make_printable_pieces(runs["patch"], 95.0)
     assert patch.size == pytest.approx((38.0, 38.0), abs=1e-6)
 
 
@@ -172,7 +172,7 @@ def test_the_command_writes_a_pdf_and_says_what_it_needs(
     assert main(["export", run, "--format", "print", "--out", str(tmp_path / "usual.pdf"), "--json"]) == 0
     own = json.loads(capsys.readouterr().out)
     assert own["size_mm"] == pytest.approx(109.5, abs=0.1)
-    monkeypatch.setattr("advsearch.api.exports.real_size", lambda run: None)  # of a file without a unit
+    monkeypatch.setattr("advsearch.api.exports.get_real_size", lambda run: None)  # of a file without a unit
     assert main(["export", run, "--format", "print", "--out", str(tmp_path / "unknown.pdf")]) == 0
     assert "longest side is taken for 100 mm; --size says otherwise" in capsys.readouterr().err
     for wrong, message in (

@@ -6,7 +6,7 @@ import io
 
 import imageio.v3 as iio
 
-from advsearch.questions.sweep.display import sweep_figure
+from advsearch.questions.sweep.display import draw_sweep
 from samples import sweep
 
 
@@ -22,7 +22,7 @@ def test_the_names_of_files_fit_the_map_of_a_sweep() -> None:
         "correct": [[4, 2]] * 3,
         "margin": [[-1.0, 0.0]] * 3,
     }
-    drawn = sweep_figure(sweep(object="ball", model=",".join(models), cells=cells))
+    drawn = draw_sweep(sweep(object="ball", model=",".join(models), cells=cells))
     text = drawn["svg"].decode("utf-8")
     assert "hardened.safetensors" in text and "somewhere" not in text
     assert iio.imread(io.BytesIO(drawn["png"])).shape[1] > 900

@@ -22,7 +22,7 @@ from advsearch.runs.export import FORMATS, as_columns, write_rows
 from advsearch.runs.exporters import EXPORTERS
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.store import NAME, Row, Store
-from advsearch.viewer.pages import keep_result
+from advsearch.viewer.pages import write_result
 from samples import attack, rated
 
 TWO: Any = {"light.place": {"value": [1.0, 2.0], "unit": ""}}
@@ -187,16 +187,16 @@ def test_a_run_whose_disk_was_full_at_the_end_goes_on_and_has_everything(
     with monkeypatch.context() as patched:
         patched.setattr("advsearch.trust.writing.os.replace", full)
         with RunDirectory.resume("one") as again, pytest.raises(StorageError, match="the disk is full"):
-            keep_result(again, result)
+            write_result(again, result)
     assert not finished(run) and not (run / full_at).exists() and not list(run.glob(".part-*"))
     with RunDirectory.resume("one") as again:
-        keep_result(again, result)
+        write_result(again, result)
     assert finished(run) and (run / "report.html").is_file()
 
 
 def test_resume_makes_the_page_again_that_is_missing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with RunDirectory.resume("one") as again:
-        keep_result(again, attack(verified=None))
+        write_result(again, attack(verified=None))
     (run / "report.html").unlink()
     assert main(["resume", "one"]) == 0 and "is done already" in capsys.readouterr().err
     assert b"<html" in (run / "report.html").read_bytes()
@@ -208,7 +208,7 @@ def test_an_export_goes_to_no_link(
     format: str, leads_to: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with RunDirectory.resume("one") as again:
-        keep_result(again, attack(verified=None))
+        write_result(again, attack(verified=None))
     target = tmp_path / "target"
     if leads_to == "an empty folder":
         target.mkdir()

@@ -275,14 +275,14 @@ def test_a_run_may_be_reached_by_a_link(run: Path, tmp_path: Path) -> None:
 
 def test_a_small_picture_that_is_a_link_is_none(run: Path, tmp_path: Path) -> None:
     """Of a million no command looks at each beforehand: each is looked at as it is read."""
-    thumbnails.keep(run, 3, b"kept")
+    thumbnails.write_thumbnail(run, 3, b"kept")
     assert thumbnails.read_thumbnail(run, 3) == b"kept"
     (tmp_path / "secret").write_bytes(b"secret")
     (run / "images/rows/0000/4.jpg").symlink_to(tmp_path / "secret")
     (run / "images/rows/0001").symlink_to(run / "images/rows/0000")
     (run / "images/rows/0000/1003.jpg").write_bytes(b"secret")
     for number in (4, 1003, 5):
-        assert thumbnails.kept_file(run, number) is None
+        assert thumbnails.find_thumbnail(run, number) is None
         with pytest.raises(FileNotFoundError):
             thumbnails.read_thumbnail(run, number)
 
@@ -322,12 +322,12 @@ def test_a_picture_of_another_format_runs_no_program(
     eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n%%EOF\n"
     (run / "images").mkdir()
     (run / "images" / "clean.png").write_bytes(eps)
-    thumbnails.keep(run, 3, eps)
-    assert thumbnails.cover(run)[:2] == b"\xff\xd8"
+    thumbnails.write_thumbnail(run, 3, eps)
+    assert thumbnails.make_cover(run)[:2] == b"\xff\xd8"
     with pytest.raises(FileFormatError, match="expected a PNG picture"):
         read_png(run / "images" / "clean.png")
     with pytest.raises(FileFormatError, match="expected a small picture"):
-        thumbnails.Kept(run, 1, some=False).png_of(3)
+        thumbnails.Thumbnails(run, 1, is_subset=False).read_png(3)
     assert not (tmp_path / "ran").exists()
 
 

@@ -11,7 +11,7 @@ from typing import ClassVar
 from pydantic import Field, computed_field
 
 from advsearch.cli.output import shown_text as check_text
-from advsearch.questions.attack.page import page as attack_page
+from advsearch.questions.attack.page import make_page as attack_page
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.report.views import facts_of, fields_shown
 from advsearch.runs.results import Fields, Interval, JsonFloat, Result, as_fact

@@ -424,13 +424,14 @@ def test_a_run_does_not_go_on_with_another_file(home: Path, setting: str, value:
 def test_files_of_one_in_several_are_repeated_elsewhere(home: Path) -> None:
     Path("camchain.yaml").write_text("one")
     assert (
-        AttackConfig(object="mug", camera="camchain.yaml#cam1").to_repeat().camera == f"{home / 'camchain.yaml'}#cam1"
+        AttackConfig(object="mug", camera="camchain.yaml#cam1").make_repeatable().camera
+        == f"{home / 'camchain.yaml'}#cam1"
     )
     Path("car.csv").write_text("one")
-    there = SweepConfig(object="mug", path="approach+car.csv").to_repeat().path
+    there = SweepConfig(object="mug", path="approach+car.csv").make_repeatable().path
     assert there == f"approach+{home / 'car.csv'}" and str(home / "car.csv") in summary.made_with({"path": there})
     assert all(
-        SweepConfig(object="mug", path=one).deciding()["path"] == "approach+car.csv"
+        SweepConfig(object="mug", path=one).get_deciding_settings()["path"] == "approach+car.csv"
         for one in (there, "approach+car.csv")
     )
 

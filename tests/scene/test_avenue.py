@@ -8,9 +8,9 @@ import torch
 
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
-from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.grounds import LUMINANCE, enclosed, paved
-from advsearch.scene.things import ground_height
+from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.grounds import LUMINANCE, is_enclosed, is_paved
+from advsearch.scene.things import find_ground_height
 from scenes.places.avenue import AVENUE, END, KERB, LAMP_HEIGHT, lamp_places
 from scenes.places.paint import FRONTS
 from scenes.places.quads import SHOWN, Quads, Wall
@@ -18,13 +18,13 @@ from scenes.places.road import KERBS
 
 
 def laid(scene: SceneDescription) -> set[str]:
-    return {name for name, part in scene.around.items() if part.laid}
+    return {name for name, part in scene.surrounding_meshes.items() if part.is_laid_ground}
 
 
 def test_kerbs_are_as_high_as_the_page_says() -> None:
     """12 cm, docs/scenes.md: a pavement lies that much above the road."""
-    scene = describe("car", "avenue")
-    heights = [ground_height(scene, np.array([0.0, y]) / scene.metres) * scene.metres for y in (0.0, -4.0, 8.0)]
+    scene = load_description("car", "avenue")
+    heights = [find_ground_height(scene, np.array([0.0, y]) / scene.metres) * scene.metres for y in (0.0, -4.0, 8.0)]
     assert heights == pytest.approx([0.0, 0.12, 0.12], abs=1e-4)
 
 
@@ -32,19 +32,19 @@ def test_kerbs_are_as_high_as_the_page_says() -> None:
 def test_an_avenue_comes_and_goes_with_its_ground() -> None:
     scene = load_scene("car", "avenue")
     assert {"road", "houses", "trees", "posts"} <= laid(scene.description)
-    assert paved(scene.description)
-    assert enclosed(scene.description)
+    assert is_paved(scene.description)
+    assert is_enclosed(scene.description)
     assert laid(scene.with_settings({"ground.kind": "road"}).description) == {"road"}
     assert not laid(scene.with_settings({"ground.size": 0.0}).description)
-    assert not enclosed(describe("car", "street"))
-    assert enclosed(describe("mug", "noon", given={"ground.kind": "avenue"}))
+    assert not is_enclosed(load_description("car", "street"))
+    assert is_enclosed(load_description("mug", "noon", given={"ground.kind": "avenue"}))
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize("name", ["car", "stop-sign"])
 def test_an_avenue_has_its_size_in_metres_whatever_stands_in_it(name: str) -> None:
-    scene = describe(name, "avenue")
-    places = {one: part.mesh.vertices * scene.metres for one, part in scene.around.items()}
+    scene = load_description(name, "avenue")
+    places = {one: part.mesh.vertices * scene.metres for one, part in scene.surrounding_meshes.items()}
     assert np.ptp(places["road"][:, 0]) > 2 * END
     assert places["houses"][:, 2].max() < 25.0
     assert places["houses"][:, 2].min() == pytest.approx(KERB, abs=1e-4)
@@ -59,7 +59,7 @@ def test_an_avenue_has_its_size_in_metres_whatever_stands_in_it(name: str) -> No
 
 @pytest.mark.medium
 def test_what_stands_in_an_avenue_faces_outwards_and_rests_on_the_ground() -> None:
-    for part in describe("car", "avenue").around.values():
+    for part in load_description("car", "avenue").surrounding_meshes.values():
         corners = part.mesh.vertices.astype(np.float64)[part.mesh.faces]
         faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         agree = (faces * part.mesh.normals[part.mesh.faces].mean(axis=1)).sum(axis=1) >= 0.0
@@ -69,7 +69,7 @@ def test_what_stands_in_an_avenue_faces_outwards_and_rests_on_the_ground() -> No
 
 @pytest.mark.medium
 def test_snow_lies_on_what_faces_up_and_on_nothing_else() -> None:
-    dry, snow = (describe("car", name).around for name in ("avenue", "avenue-snow"))
+    dry, snow = (load_description("car", name).surrounding_meshes for name in ("avenue", "avenue-snow"))
     assert set(snow) - set(dry) == {"snow"}
     corners = snow["snow"].mesh.vertices.astype(np.float64)[snow["snow"].mesh.faces]
     assert (snow["snow"].mesh.normals[snow["snow"].mesh.faces].mean(axis=1)[:, 2] > 0.0).all()
@@ -116,9 +116,9 @@ def test_a_gradient_among_houses_is_that_of_differences() -> None:
 
 
 def test_lamps_shine_at_dusk_with_the_light_that_they_are_said_to_have() -> None:
-    assert describe("car", "avenue").around["street-lamps"].emission is None
-    night = describe("car", "avenue-night")
-    lamps, unit = night.around["street-lamps"], night.environment
+    assert load_description("car", "avenue").surrounding_meshes["street-lamps"].emission is None
+    night = load_description("car", "avenue-night")
+    lamps, unit = night.surrounding_meshes["street-lamps"], night.environment
     assert lamps.emission is not None
     assert unit is not None
     assert unit.candelas is not None
@@ -130,9 +130,9 @@ def test_lamps_shine_at_dusk_with_the_light_that_they_are_said_to_have() -> None
 
 
 def test_an_absolute_exposure_shows_night_as_night() -> None:
-    day, night = (describe("car", name, given={"camera.ev": 14.0}) for name in ("avenue", "avenue-night"))
+    day, night = (load_description("car", name, given={"camera.ev": 14.0}) for name in ("avenue", "avenue-night"))
     assert day.environment is not None
     assert day.gain == pytest.approx(day.environment.candelas / (1.2 * 2.0**14))  # type: ignore[operator]
     assert night.gain < 1e-3 * day.gain
     with pytest.raises(InputError, match=r"camera.ev: the brightness of this environment has no unit"):
-        _ = describe("car", "street", given={"camera.ev": 14.0}).gain
+        _ = load_description("car", "street", given={"camera.ev": 14.0}).gain

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.description import describe
+from advsearch.scene.description import load_description
 from advsearch.scene.importing import blender
 from advsearch.scene.importing.objects import import_object
 from advsearch.trust import programs
@@ -47,7 +47,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_blender_file_is_read_as_the_gltf_that_blender_makes_of_it(folder: Path) -> None:
-    scene = describe(f"{folder}/room.blend#crate")
+    scene = load_description(f"{folder}/room.blend#crate")
     assert set(scene.meshes) == {"object", "post"} and scene.object.up is not None and scene.object.up.axis == "y"
     assert import_object(folder / "room.blend").name == "room"
 
@@ -56,7 +56,7 @@ def test_nothing_in_the_file_is_run(folder: Path) -> None:
     import_object(folder / "room.blend")
     arguments, environment = json.loads((folder / "seen.json").read_text())
     assert arguments[:3] == ["--background", "--factory-startup", "--disable-autoexec"]
-    assert "use_scripts=False" in blender.EXPORT
+    assert "use_scripts=False" in blender.EXPORT_SCRIPT
     assert environment["HOME"] == environment["TMPDIR"] != os.environ["HOME"] and "SECRET" not in environment
     assert not Path(environment["HOME"]).exists()
 

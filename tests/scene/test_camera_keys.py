@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.camera_entries import QUIET, plain
+from advsearch.scene.camera_entries import IGNORED_KEYS, normalize_key
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel
 
@@ -129,14 +129,14 @@ def harmless(path: tuple[Any, ...]) -> bool:
         "roi",
         "fisheye_model",
     )
-    return any(QUIET.fullmatch(plain(one)) or one in places for one in last)
+    return any(IGNORED_KEYS.fullmatch(normalize_key(one)) or one in places for one in last)
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_a_number_that_is_changed_is_seen_or_told(kind: str, tmp_path: Path) -> None:
     """Also where it is one of a matrix; what is on the list of those without effect has none."""
     whole = read(tmp_path, KINDS[kind])
-    assert whole.told == ()
+    assert whole.reading_notes == ()
     for path in numbers(KINDS[kind]):
         data = copy.deepcopy(KINDS[kind])
         inner: Any = data
@@ -148,7 +148,7 @@ def test_a_number_that_is_changed_is_seen_or_told(kind: str, tmp_path: Path) -> 
         except FileFormatError:
             assert not harmless(path) or "roi" in path, path
             continue
-        changed = (found.numbers, found.size) != (whole.numbers, whole.size) or found.told != ()
+        changed = (found.numbers, found.size) != (whole.numbers, whole.size) or found.reading_notes != ()
         assert changed != harmless(path), path
 
 
@@ -165,7 +165,7 @@ def everywhere(kind: str, key: str, value: object) -> Iterator[dict[str, Any]]:
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_an_unknown_key_is_told(kind: str, tmp_path: Path) -> None:
     for data in everywhere(kind, "zoominess", 1.5):
-        told = read(tmp_path, data).told
+        told = read(tmp_path, data).reading_notes
         assert len(told) == 1 and "zoominess" in told[0], data
 
 
@@ -175,7 +175,7 @@ def test_a_key_that_makes_another_picture_is_refused_by_name(kind: str, key: str
     for data in everywhere(kind, key, 1.5):
         inside_a_matrix = any(isinstance(one, dict) and "data" in one and key in one for one in data.values())
         if inside_a_matrix:
-            assert key in read(tmp_path, data).told[0]
+            assert key in read(tmp_path, data).reading_notes[0]
             continue
         with pytest.raises(FileFormatError, match=key):
             read(tmp_path, data)
@@ -200,7 +200,7 @@ def test_a_panorama_of_kalibr_looks_ahead_in_its_middle(tmp_path: Path) -> None:
 
 def test_rectification_is_told_where_it_is_some(tmp_path: Path) -> None:
     turned = KINDS["ros"] | {"r": [0.8, 0.6, 0.0, -0.6, 0.8, 0.0, 0.0, 0.0, 1.0]}
-    (told,) = read(tmp_path, turned).told
+    (told,) = read(tmp_path, turned).reading_notes
     assert "rectification_matrix" in told and "the camera's own ones" in told and "projection" not in told
 
 
@@ -225,7 +225,7 @@ def test_of_a_stereo_pair_the_first_camera_is_read_and_the_second_told(tmp_path:
     pair = {f"{key}{one}": value for one in (1, 2) for key, value in (("cameraMatrix", MATRIX), ("distCoeffs", FOUR))}
     found = read(tmp_path, pair | {"image_width": 640, "image_height": 480})
     assert found.numbers == read(tmp_path, KINDS["scalars"]).numbers
-    assert found.told == (f"{tmp_path / 'camera.json'}: not read: 'cameraMatrix2', 'distCoeffs2'.",)
+    assert found.reading_notes == (f"{tmp_path / 'camera.json'}: not read: 'cameraMatrix2', 'distCoeffs2'.",)
 
 
 def test_frames_with_lenses_of_their_own_are_chosen_by_number(tmp_path: Path) -> None:
@@ -273,7 +273,7 @@ def test_an_xml_has_its_keys_told_too(tmp_path: Path) -> None:
         f"<camera_matrix type_id='opencv-matrix'><rows>3</rows><cols>3</cols><dt>d</dt><data>"
         f"{' '.join(map(str, MATRIX))}</data></camera_matrix><zoominess>2</zoominess></opencv_storage>"
     )
-    assert "zoominess" in read_camera(str(path)).told[0]
+    assert "zoominess" in read_camera(str(path)).reading_notes[0]
     path.write_text(path.read_text().replace("zoominess", "xi"))
     with pytest.raises(FileFormatError, match="xi"):
         read_camera(str(path))

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from advsearch.controls.camera import ROAD_USERS, CameraControl
+from advsearch.controls.camera import ROAD_USER_HEIGHTS, CameraControl
 from advsearch.controls.path import PathControl
-from advsearch.engine.loading import Scene, load_scene, scene_as_settings
+from advsearch.engine.loading import Scene, load_scene, scene_to_settings
 from advsearch.errors import InputError
 from advsearch.scene.camera_entries import PRESETS
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.grounds import view_of
+from advsearch.scene.grounds import make_camera_view
 
 
 def lens(scene: SceneDescription, to_world: torch.Tensor | None = None) -> np.ndarray:
@@ -41,8 +41,8 @@ def test_a_mounted_camera_is_as_high_as_it_is(name: str, camera: str, environmen
     scene = seen(name, camera, environment, **({"size": 0.1} if name == "mug" else {}))
     assert lens(scene)[2] == pytest.approx(height, abs=1e-4)
     assert scene.number("camera.fov") == PRESETS[camera].fov
-    assert scene_as_settings(Scene(scene))["camera"] == camera
-    assert "set" in scene_as_settings(Scene(scene)) and not scene.given_values
+    assert scene_to_settings(Scene(scene))["camera"] == camera
+    assert "set" in scene_to_settings(Scene(scene)) and not scene.requested_values
 
 
 @pytest.mark.parametrize("name", ["car", "stop-sign"])
@@ -57,7 +57,7 @@ def test_what_is_given_wins_over_a_preset() -> None:
     scene = seen("car", "dashcam", settings=given)
     x, _, z = lens(scene)
     assert (x > 0.0, z, scene.number("camera.fov")) == (True, pytest.approx(1.1, abs=1e-4), 60.0)
-    assert view_of(seen("car", "dashcam", settings={"camera.elevation": 10.0})).height > 2.0
+    assert make_camera_view(seen("car", "dashcam", settings={"camera.elevation": 10.0})).height > 2.0
     moved = Scene(seen("car", "dashcam")).with_settings({"camera.elevation": 10.0}).description
     assert lens(moved)[2] > 2.0
 
@@ -83,14 +83,14 @@ def test_a_drive_of_a_dashcam_keeps_its_height() -> None:
 
 
 def test_a_vehicle_is_seen_from_the_heights_of_road_users() -> None:
-    car, mug = (CameraControl().bind(describe(name, "street")) for name in ("car", "mug"))
+    car, mug = (CameraControl().bind(load_description(name, "street")) for name in ("car", "mug"))
     assert "elevation" in {group.parameter for group in mug.groups}
     assert {group.parameter for group in car.groups} == {
         "azimuth", "roll", "distance", "height"
     }  # fmt: skip
-    scene = describe("car", "street")
+    scene = load_description("car", "street")
     for u in (torch.zeros(4), torch.ones(4), torch.full((4,), 0.5)):
-        low, high = ROAD_USERS
+        low, high = ROAD_USER_HEIGHTS
         assert low - 1e-3 <= lens(scene, car.inputs(u)["camera.to_world"])[2] <= high + 1e-3
     start = car.inputs(car.start)["camera.to_world"].double().numpy()
     np.testing.assert_allclose(start, camera_to_world(scene), atol=1e-5)
@@ -100,15 +100,15 @@ def test_a_vehicle_is_seen_from_the_heights_of_road_users() -> None:
 
 def test_a_height_and_an_elevation_contradict_each_other() -> None:
     with pytest.raises(InputError, match=r"camera.elevation and camera.height say the same thing"):
-        describe("car", given={"camera.elevation": 10.0, "camera.height": 1.3})
+        load_description("car", given={"camera.elevation": 10.0, "camera.height": 1.3})
     with pytest.raises(InputError, match="elevation and height say the same thing"):
-        CameraControl(elevation=[0.0, 5.0], height=[1.0, 2.0]).prepare(describe("car"))
+        CameraControl(elevation=[0.0, 5.0], height=[1.0, 2.0]).prepare(load_description("car"))
     with pytest.raises(InputError, match=r"`camera=dashcam` is 1.3 m high, and how large mug is is not known"):
-        replace(scene := describe("mug"), object=replace(scene.object, metres=None)).seen_by("dashcam")
+        replace(scene := load_description("mug"), object=replace(scene.object, metres=None)).with_camera("dashcam")
 
 
 def test_a_height_is_searched_at_any_distance() -> None:
-    scene = describe("car", "street", given={"camera.azimuth": 0.0})
+    scene = load_description("car", "street", given={"camera.azimuth": 0.0})
     bound = CameraControl(height=[0.8, 2.0], distance=[6.0, 60.0]).bind(scene)
     for u, height in ((torch.tensor([0.0, 0.0]), 0.8), (torch.tensor([1.0, 1.0]), 2.0)):
         assert lens(scene, bound.inputs(u)["camera.to_world"])[2] == pytest.approx(height, abs=1e-3)

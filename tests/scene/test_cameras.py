@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 
 import advsearch
-from advsearch.engine.loading import Scene, framed
-from advsearch.engine.rendering import sight_of
+from advsearch.engine.loading import Scene, fit_camera
+from advsearch.engine.rendering import make_sight
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.camera_files import read_camera
-from advsearch.scene.camera_model import NUMBERS, CameraModel, bundled, pinhole
+from advsearch.scene.camera_model import NUMBER_NAMES, CameraModel, make_bundled_models, make_pinhole
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
@@ -37,13 +37,15 @@ STILL: dict[str, object] = {"pose": {"yaw": [0, 1]}}
 
 FOLDING = "k1=-0.6"
 LENSES = {
-    "pinhole": pinhole(60.0, 1.0),
-    "barrel": pinhole(60.0, 1.0).with_numbers(torch.tensor([0.8, 0.9, 0.5, 0.45, 0.02, -0.28, 0.07, 0.01, *[0.0] * 9])),
-    "decentred": pinhole(60.0, 1.0).with_numbers(
+    "pinhole": make_pinhole(60.0, 1.0),
+    "barrel": make_pinhole(60.0, 1.0).with_numbers(
+        torch.tensor([0.8, 0.9, 0.5, 0.45, 0.02, -0.28, 0.07, 0.01, *[0.0] * 9])
+    ),
+    "decentred": make_pinhole(60.0, 1.0).with_numbers(
         torch.tensor([0.6, 0.8, 0.51, 0.48, 0.01, 1.2, 0.7, 0.1, 1.5, 0.9, 0.2, 0.003, 0.001, 0.01, -0.02, 0.005, 0.01])
     ),
-    FOLDING: pinhole(60.0, 1.0).with_numbers(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11])),
-    **bundled(),
+    FOLDING: make_pinhole(60.0, 1.0).with_numbers(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11])),
+    **make_bundled_models(),
 }
 
 
@@ -102,7 +104,7 @@ def test_opencv_itself_agrees(model: str, tmp_path: Path, reference: ModuleType)
 
 @pytest.mark.parametrize("name", [name for name in LENSES if name != "equirectangular"])
 def test_a_ray_is_seen_in_the_place_that_it_comes_from(name: str) -> None:
-    directions, inside = LENSES[name].rays(grid())
+    directions, inside = LENSES[name].compute_rays(grid())
     places, seen = LENSES[name].project(3.0 * directions)
     assert bool(seen[inside > 0.0].all())
     assert float((places - grid())[inside > 0.0].abs().max()) < 1e-7
@@ -110,7 +112,9 @@ def test_a_ray_is_seen_in_the_place_that_it_comes_from(name: str) -> None:
 
 
 def test_a_panorama_has_what_is_ahead_in_its_middle_and_the_zenith_on_top() -> None:
-    places, _ = bundled()["equirectangular"].project(torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, -1, 0], [-1, 0, -1e-9]]))
+    places, _ = make_bundled_models()["equirectangular"].project(
+        torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, -1, 0], [-1, 0, -1e-9]])
+    )
     torch.testing.assert_close(
         places, torch.tensor([[0.5, 0.5], [0.75, 0.5], [0.5, 0.0], [0.25, 0.5]]).double(), atol=1e-6, rtol=0
     )
@@ -118,10 +122,10 @@ def test_a_panorama_has_what_is_ahead_in_its_middle_and_the_zenith_on_top() -> N
 
 def test_a_lens_that_folds_says_at_which_angle_and_is_black_beyond() -> None:
     lens = LENSES[FOLDING]
-    assert math.isclose(math.degrees(lens.fold), math.degrees(math.atan(math.sqrt(1.0 / 1.8))), rel_tol=1e-6)
+    assert math.isclose(math.degrees(lens.fold_angle), math.degrees(math.atan(math.sqrt(1.0 / 1.8))), rel_tol=1e-6)
     (note,) = lens.notes
     assert "folds at 36.7 degrees" in note
-    _, inside = lens.rays(torch.tensor([[0.5, 0.5], [0.0, 0.0]], dtype=torch.float64))
+    _, inside = lens.compute_rays(torch.tensor([[0.5, 0.5], [0.0, 0.0]], dtype=torch.float64))
     assert inside[0] > 0.0 > inside[1]
 
 
@@ -167,7 +171,7 @@ def test_one_camera_in_each_kind_of_file_is_the_same(name: str, tmp_path: Path) 
     wanted = {"fx": 902.5 / 1280, "fy": 911.75 / 720, "cx": 645.75 / 1280, "cy": 353.0 / 720}
     wanted |= dict(zip(("k1", "k2", "p1", "p2"), K, strict=True))
     assert found.kind == "brown-conrady" and found.size == (720, 1280)
-    assert found.values == pytest.approx({**dict.fromkeys(NUMBERS, 0.0), **wanted})
+    assert found.values == pytest.approx({**dict.fromkeys(NUMBER_NAMES, 0.0), **wanted})
 
 
 def test_binned_pixels_are_fewer_and_see_the_same(tmp_path: Path) -> None:
@@ -338,8 +342,12 @@ def test_the_same_camera_in_files_of_other_tools(name: str, tmp_path: Path) -> N
     path = tmp_path / name
     path.with_name(name.partition("#")[0]).write_text(text)
     found = read_camera(str(path))
-    assert found.kind == kind and found.size == (720, 1280) and not [note for note in found.told if "M2" not in note]
-    assert found.values == pytest.approx({**dict.fromkeys(NUMBERS, 0.0), **BROWN_NUMBERS, **numbers})
+    assert (
+        found.kind == kind
+        and found.size == (720, 1280)
+        and not [note for note in found.reading_notes if "M2" not in note]
+    )
+    assert found.values == pytest.approx({**dict.fromkeys(NUMBER_NAMES, 0.0), **BROWN_NUMBERS, **numbers})
 
 
 @pytest.mark.parametrize(
@@ -404,7 +412,7 @@ def test_files_of_other_tools_that_are_not_read_are_named(text: str, words: str,
 def test_what_is_not_read_of_files_of_other_tools_is_named(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text(orbslam("Camera", "PinHole", "k1") + "Camera.newWidth: 640\nstrange: 1\n")
-    (note,) = read_camera(str(path)).told
+    (note,) = read_camera(str(path)).reading_notes
     assert "not read: 'newWidth', 'strange'." in note
 
 
@@ -420,7 +428,7 @@ def rays_of(scene: MitsubaScene, places: Tensor) -> tuple[Tensor, Tensor]:
     """Directions of Mitsuba's rays in the camera's coordinates, and which of them see something."""
     import mitsuba as mi
 
-    sensor = scene.held({}).sensors()[0]
+    sensor = scene.set_inputs({}).sensors()[0]
     columns = mi.Point2f(places.T.float().contiguous().numpy())
     ray, weight = sensor.sample_ray(0.0, 0.5, columns, mi.Point2f(0.5))
     local = sensor.world_transform().inverse() @ ray.d
@@ -436,7 +444,7 @@ def test_rays_inside_mitsuba_are_those_of_the_model(name: str) -> None:
     found, _ = model.project(directions)
     off = side * (found - places.double()).norm(dim=1)[seen]
     assert float(off.quantile(0.99)) < HUNDREDTH
-    assert torch.equal(seen, model.rays(places)[1] > 0.0)
+    assert torch.equal(seen, model.compute_rays(places)[1] > 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -448,11 +456,11 @@ def through_fisheye() -> Renderer:
 def test_the_object_is_seen_where_the_model_projects_it(through_fisheye: Renderer) -> None:
     """The mask, and with it the box that a detector should find."""
     rows, columns = torch.nonzero(through_fisheye.mask(through_fisheye.start), as_tuple=True)
-    description = through_fisheye.scene.made[0]
+    description = through_fisheye.scene.definition[0]
     pose = torch.from_numpy(camera_to_world(description))
     vertices = torch.from_numpy(description.base_vertices)
     points = (vertices - pose[:3, 3]) @ pose[:3, :3] * torch.tensor([-1.0, -1.0, 1.0])
-    places, _ = bundled()["fisheye"].project(points)
+    places, _ = make_bundled_models()["fisheye"].project(points)
     low, high = 32 * places.amin(dim=0), 32 * places.amax(dim=0)
     seen = torch.stack([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]).double()
     assert float((seen - torch.cat([low, high])).abs().max()) < 1.0
@@ -463,8 +471,8 @@ def test_outside_the_circle_all_is_black_in_pictures_guides_and_predictions(thro
     with torch.no_grad():
         traced = through_fisheye.radiance(u, 1, 16)
         predicted = LinearRenderer(through_fisheye, u, seed=1).renderer.radiance(u)
-    albedo, normal = through_fisheye.scene.guides({}, 0, 4)
-    for picture in (through_fisheye.scene.radiance({}, 1, 4), albedo, normal):
+    albedo, normal = through_fisheye.scene.render_guides({}, 0, 4)
+    for picture in (through_fisheye.scene.render_radiance({}, 1, 4), albedo, normal):
         assert float(picture[corner].abs().max()) == 0.0
     for picture in (traced, predicted):
         assert float(picture[corner].abs().max()) < 1e-3, "the denoiser leaves a little"
@@ -507,9 +515,9 @@ def test_truth_is_that_of_the_distorted_picture(camera: str, tmp_path: Path) -> 
     with torch.no_grad():
         white, black = (one.radiance(torch.full_like(one.start, value), 1, 32) for value in (1.0, 0.0))
     painted = (white - black).mean(dim=-1) > 0.15 * float((white - black).mean(dim=-1).max())
-    truth = sight_of(one.surfaces(one.start))
-    seen = Facts("mug", look=lambda: truth)
-    shown = Facts("mug", look=lambda: replace(truth, mask=painted))
+    truth = make_sight(one.surfaces(one.start))
+    seen = Facts("mug", compute_sight=lambda: truth)
+    shown = Facts("mug", compute_sight=lambda: replace(truth, mask=painted))
     assert seen.box is not None and shown.box is not None
     assert max(abs(a - b) for a, b in zip(seen.box, shown.box, strict=True)) <= 1
     assert float((seen.mask & painted).sum()) > 0.85 * float((seen.mask | painted).sum())
@@ -525,7 +533,7 @@ def test_truth_is_that_of_the_distorted_picture(camera: str, tmp_path: Path) -> 
 
 
 def test_what_a_lens_shows_has_a_derivative_in_the_texture(through_fisheye: Renderer) -> None:
-    exact = through_fisheye.like(denoiser="none")
+    exact = through_fisheye.copy_with(denoiser="none")
     u = through_fisheye.start.clone().requires_grad_()
     exact(u, 1, 16)[14:18, 14:18].mean().backward()
     assert u.grad is not None
@@ -536,9 +544,9 @@ def test_what_a_lens_shows_has_a_derivative_in_the_texture(through_fisheye: Rend
 
 
 def test_depth_refuses_a_lens_that_sees_far_aside(through_fisheye: Renderer) -> None:
-    truth = sight_of(through_fisheye.surfaces(through_fisheye.start))
+    truth = make_sight(through_fisheye.surfaces(through_fisheye.start))
     with pytest.raises(InputError, match="sees things more than 84 degrees from its axis"):
-        Depth().truth(Facts("mug", look=lambda: truth))
+        Depth().truth(Facts("mug", compute_sight=lambda: truth))
 
 
 # ---- as users name it -----------------------------------------------------------------------------------------------
@@ -547,7 +555,7 @@ def test_depth_refuses_a_lens_that_sees_far_aside(through_fisheye: Renderer) -> 
 def test_a_picture_of_another_size_is_scaled_and_said(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text(GOOD)
-    notes = framed(advsearch.load_scene("mug", camera=str(path)).description, 16).notes
+    notes = fit_camera(advsearch.load_scene("mug", camera=str(path)).description, 16).notes
     assert any("is for 1280 x 720 pixels" in one and "scaled to 16 x 16" in one for one in notes)
 
 

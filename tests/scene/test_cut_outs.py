@@ -14,11 +14,11 @@ from trimesh.visual.material import PBRMaterial
 
 import advsearch
 from advsearch.controls import make_control, make_space
-from advsearch.scene.assembly import posed
+from advsearch.scene.assembly import pose_mesh
 from advsearch.scene.description import OBJECT
-from advsearch.scene.glb import glb
+from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene
 
 pytestmark = pytest.mark.usefixtures("two_threads")
@@ -67,7 +67,7 @@ def test_what_is_cut_out_is_not_seen(framed: Path) -> None:
     assert last - first >= 8 and bool(mask[first : first + 2, first:last].all()) and not mask[hole, hole].any()
     red = picture[..., 0] > 2.0 * picture[..., 1]
     assert red[mask].float().mean() > 0.9 and not red[hole, hole].any()
-    albedo, normal = renderer.scene.guides({}, 0, 64)
+    albedo, normal = renderer.scene.render_guides({}, 0, 64)
     assert albedo[hole, hole].max() == 0.0 and normal[hole, hole].abs().max() == 0.0
     assert albedo[mask][:, 0].mean() > 0.8 and normal[mask].norm(dim=-1).mean() > 0.8
 
@@ -114,7 +114,7 @@ def test_gltf_out_has_the_same_cut_outs(mode: str, tmp_path: Path) -> None:
     file = tmp_path / "card.glb"
     file.write_bytes(card(window() if mode == "MASK" else window() * 0.6, mode).export(file_type="glb"))
     part = advsearch.load_scene(file).description.meshes[OBJECT]
-    (tmp_path / "out.glb").write_bytes(glb([posed(part, {})]))
+    (tmp_path / "out.glb").write_bytes(encode_glb([pose_mesh(part, {})]))
     again = import_object(tmp_path / "out.glb")
     assert part.opacity is not None and again.opacity is not None
     np.testing.assert_allclose(again.opacity, part.opacity, atol=0.003)
@@ -124,9 +124,9 @@ def test_stock_mitsuba_renders_the_cut_outs_that_are_written(framed: Path, tmp_p
     renderer = advsearch.load_scene(framed, settings=SEEN).renderer("pose", resolution=SIZE, denoise="none")
     (tmp_path / "out").mkdir()
     write_scene(renderer.scene, {}, tmp_path / "out" / "scene.xml", "")
-    mi = mitsuba()
+    mi = import_mitsuba()
     theirs = torch.from_numpy(np.array(mi.render(mi.load_file(str(tmp_path / "out" / "scene.xml")), spp=256)))[..., :3]
-    ours = renderer.scene.radiance({}, 0, 256)
+    ours = renderer.scene.render_radiance({}, 0, 256)
     assert (theirs - ours).abs().mean() < 0.03 * ours.mean()
 
 

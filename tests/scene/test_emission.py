@@ -19,16 +19,16 @@ from trimesh.visual.material import PBRMaterial
 
 import advsearch
 from advsearch.errors import FileFormatError, InputError
-from advsearch.scene.assembly import posed
+from advsearch.scene.assembly import pose_mesh
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import OBJECT, SceneDescription, describe
-from advsearch.scene.formation import EVERYTHING, irradiance
-from advsearch.scene.glb import glb
+from advsearch.scene.description import OBJECT, SceneDescription, load_description
+from advsearch.scene.formation import ALL_OMISSIONS, compute_irradiance
+from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.mitsuba_backend.meshes import sampling_weights
+from advsearch.scene.mitsuba_backend.meshes import compute_sampling_weights
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene
 from advsearch.scene.parts import PointLamp
 from advsearch.scene.transport.lights import BasisRenderer
@@ -82,7 +82,7 @@ def written(folder: Path, made: Any, strength: float = 1.0, **entries: Any) -> P
 
 
 def radiance(file: Path | str, spp: int = 64) -> torch.Tensor:
-    return MitsubaScene(describe(str(file), "none", given=SEEN), (SIZE, SIZE)).radiance({}, 0, spp)
+    return MitsubaScene(load_description(str(file), "none", given=SEEN), (SIZE, SIZE)).render_radiance({}, 0, spp)
 
 
 def test_a_surface_is_as_bright_as_its_file_says(tmp_path: Path) -> None:
@@ -93,9 +93,9 @@ def test_a_surface_is_as_bright_as_its_file_says(tmp_path: Path) -> None:
 
 
 def test_a_texture_is_where_it_belongs(tmp_path: Path) -> None:
-    scene = describe(str(written(tmp_path, card(picture=stripes()), 3.0)), "none", given=SEEN)
+    scene = load_description(str(written(tmp_path, card(picture=stripes()), 3.0)), "none", given=SEEN)
     assert scene.notes == ()
-    picture = MitsubaScene(scene, (SIZE, SIZE), max_depth=1).radiance({}, 0, 16)
+    picture = MitsubaScene(scene, (SIZE, SIZE), max_depth=1).render_radiance({}, 0, 16)
     left, right, top, bottom = (SIZE // 2 + away for away in (-4, 4, -4, 4))
     half = 3.0 * float(srgb_to_linear(np.array([128 / 255], np.float32))[0])
     for row, column, wanted in ((top, left, [3, 0, 0]), (top, right, [3, 0, 0]), (bottom, left, [half] * 3)):
@@ -122,12 +122,12 @@ def room(picture: np.ndarray | None, uv: np.ndarray = UNIT, parts: int = 1) -> t
 def both_ways(scene: SceneDescription, lamp: str, seen: str) -> tuple[torch.Tensor, torch.Tensor]:
     """The mean radiance (3,) of what is seen, with light that is sampled, and with light that is met by chance."""
     made = MitsubaScene(scene.with_part(PointLamp("dark")), (SIZE, SIZE), max_depth=3)
-    shown = made.surfaces({}).seen(seen)
-    found = torch.stack([made.radiance({}, seed, 256)[shown] for seed in range(4)]).mean(dim=(0, 1))
+    shown = made.find_surfaces({}).visible_mask(seen)
+    found = torch.stack([made.render_radiance({}, seed, 256)[shown] for seed in range(4)]).mean(dim=(0, 1))
     made.parameters[f"{lamp}.emitter.sampling_weight"] = 0.0
     made.parameters.update()
     made._recorded.clear()
-    chance = torch.stack([made.radiance({}, seed, 4096)[shown] for seed in range(4)]).mean(dim=(0, 1))
+    chance = torch.stack([made.render_radiance({}, seed, 4096)[shown] for seed in range(4)]).mean(dim=(0, 1))
     return found, chance
 
 
@@ -146,7 +146,7 @@ def test_light_arrives_as_by_paths_that_find_it_by_chance(way: str, tmp_path: Pa
     """Next-event estimation of a texture counts on coordinates that no two faces share."""
     picture, uv = WAYS[way]
     seen = {**SEEN, "camera.azimuth": 30.0, "camera.elevation": 20.0}
-    scene = describe(f"{written(tmp_path, room(picture, uv), 5.0)}#wall", "none", given=seen)
+    scene = load_description(f"{written(tmp_path, room(picture, uv), 5.0)}#wall", "none", given=seen)
     assert scene.meshes["lamp0"].emission is not None
     found, chance = both_ways(scene, "lamp0", OBJECT)
     assert float(found.mean()) > 0.01
@@ -157,7 +157,7 @@ def test_light_arrives_as_by_paths_that_find_it_by_chance(way: str, tmp_path: Pa
 def test_several_parts_are_lit_in_one_map(tmp_path: Path) -> None:
     """The dark parts of an object stay dark, and the light of the other one is all there."""
     seen = {**SEEN, "camera.azimuth": 30.0, "camera.elevation": 20.0}
-    scene = describe(str(written(tmp_path, room(None, parts=2), 5.0)), "none", given=seen)
+    scene = load_description(str(written(tmp_path, room(None, parts=2), 5.0)), "none", given=seen)
     emission = scene.object.emission
     assert emission is not None and emission.shape == scene.object.base_color.shape
     assert set(np.unique(emission.round(3))) == {0.0, 5.0} and emission.mean() < 1.0
@@ -245,26 +245,28 @@ def test_a_part_that_is_cut_out_whole_is_dark_beside_another(cutoff: float, dark
     file = tmp_path / "room.glb"
     lamp = {"emissiveFactor": [1.0, 1.0, 1.0], "alphaMode": "MASK", "alphaCutoff": cutoff}
     file.write_bytes(changed(scene.export(file_type="glb"), shines.index(True), **lamp))
-    described = describe(str(file), given=SEEN)
-    assert described.emits is not dark
+    described = load_description(str(file), given=SEEN)
+    assert described.has_emission is not dark
     MitsubaScene(described, (SIZE, SIZE))
 
 
 @pytest.mark.medium
 def test_a_moved_surface_lights_from_where_it_is(tmp_path: Path) -> None:
     """Whatever Mitsuba kept of the place where it was."""
-    scene = describe(f"{written(tmp_path, room(stripes()), 5.0)}#wall", "none", given=SEEN)
+    scene = load_description(f"{written(tmp_path, room(stripes()), 5.0)}#wall", "none", given=SEEN)
     made = MitsubaScene(scene, (SIZE, SIZE), max_depth=2)
-    made.radiance({}, 0, 64)
-    places = made.base("lamp0.vertices") + torch.tensor([0.3, 0.5, 0.0])
-    moved = made.radiance({"lamp0.vertices": places}, 1, 512)
-    part = scene.around["lamp0"]
+    made.render_radiance({}, 0, 64)
+    places = made.get_base_value("lamp0.vertices") + torch.tensor([0.3, 0.5, 0.0])
+    moved = made.render_radiance({"lamp0.vertices": places}, 1, 512)
+    part = scene.surrounding_meshes["lamp0"]
     matrix = part.to_world.copy()
     matrix[:3, 3] += [0.3, 0.5, 0.0]
     fresh = MitsubaScene(replace(scene, parts=(replace(part, to_world=matrix),)), (SIZE, SIZE), max_depth=2)
-    np.testing.assert_allclose(moved, fresh.radiance({}, 1, 512), atol=1e-3)
-    again = MitsubaScene(scene, (SIZE, SIZE), max_depth=2, leave_out=EVERYTHING - {"tracing"}).radiance({}, 2, 64)
-    np.testing.assert_allclose(made.radiance({}, 2, 64), again, atol=1e-3)
+    np.testing.assert_allclose(moved, fresh.render_radiance({}, 1, 512), atol=1e-3)
+    again = MitsubaScene(scene, (SIZE, SIZE), max_depth=2, leave_out=ALL_OMISSIONS - {"tracing"}).render_radiance(
+        {}, 2, 64
+    )
+    np.testing.assert_allclose(made.render_radiance({}, 2, 64), again, atol=1e-3)
 
 
 @pytest.mark.medium
@@ -297,8 +299,8 @@ def test_the_exposure_meter_sees_surroundings_that_emit_light(tmp_path: Path) ->
         scene = trimesh.Scene()
         scene.add_geometry(card(vertices=far, picture=picture), node_name="lamp")
         scene.add_geometry(wall, node_name="wall")
-        described = describe(f"{written(tmp_path, scene, 50.0)}#wall", "none", given=SEEN)
-        part = described.around["lamp"]
+        described = load_description(f"{written(tmp_path, scene, 50.0)}#wall", "none", given=SEEN)
+        part = described.surrounding_meshes["lamp"]
         assert part.emission is not None
         level = part.emission.mean(axis=(0, 1)) if mean is None else np.full(3, 50.0)
         lamp = PointLamp(
@@ -306,14 +308,14 @@ def test_the_exposure_meter_sees_surroundings_that_emit_light(tmp_path: Path) ->
         )
         like = replace(described, parts=(lamp,))
         normals = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-        np.testing.assert_allclose(irradiance(described, normals), irradiance(like, normals), rtol=0.25)
-        assert described.lit and described.gain == pytest.approx(like.gain, rel=0.25)
+        np.testing.assert_allclose(compute_irradiance(described, normals), compute_irradiance(like, normals), rtol=0.25)
+        assert described.is_lit and described.gain == pytest.approx(like.gain, rel=0.25)
 
 
 @pytest.mark.parametrize("picture", [None, stripes()])
 def test_gltf_out_emits_the_same(picture: np.ndarray | None, tmp_path: Path) -> None:
-    part = describe(str(written(tmp_path, card(picture=picture), 7.0))).meshes[OBJECT]
-    (tmp_path / "out.glb").write_bytes(glb([posed(part, {})]))
+    part = load_description(str(written(tmp_path, card(picture=picture), 7.0))).meshes[OBJECT]
+    (tmp_path / "out.glb").write_bytes(encode_glb([pose_mesh(part, {})]))
     again = import_object(tmp_path / "out.glb")
     assert part.emission is not None and again.emission is not None and again.warnings == ()
     np.testing.assert_allclose(again.emission, part.emission, atol=0.05)
@@ -326,9 +328,9 @@ def test_stock_mitsuba_renders_the_emission_that_is_written(picture: np.ndarray 
     renderer = loaded.renderer("pose", resolution=SIZE, denoise="none")
     (tmp_path / "out").mkdir()
     write_scene(renderer.scene, {}, tmp_path / "out" / "scene.xml", "")
-    mi = mitsuba()
+    mi = import_mitsuba()
     theirs = torch.from_numpy(np.array(mi.render(mi.load_file(str(tmp_path / "out" / "scene.xml")), spp=256)))[..., :3]
-    ours = renderer.scene.radiance({}, 0, 256)
+    ours = renderer.scene.render_radiance({}, 0, 256)
     assert float(ours.mean()) > 0.01 and (theirs - ours).abs().mean() < 0.03 * ours.mean()
 
 
@@ -351,13 +353,13 @@ def test_derivatives_of_poses_are_differences_and_of_textures_adjoints(tmp_path:
 def test_the_adjoint_of_a_texture_is_right_beside_emission(picture: np.ndarray | None, tmp_path: Path) -> None:
     """Central differences of all texels, and of the radiance itself; the wall and the square light each other."""
     seen = {**SEEN, "camera.azimuth": 30.0}
-    scene = describe(f"{written(tmp_path, room(picture), 5.0)}#wall", "none", given=seen)
+    scene = load_description(f"{written(tmp_path, room(picture), 5.0)}#wall", "none", given=seen)
     made = MitsubaScene(scene, (SIZE, SIZE), max_depth=4)
     ones = torch.ones(SIZE, SIZE, 3)
     for name, step in (("object.base_color", 0.05), ("lamp0.radiance", 0.5)):
-        base = made.base(name)
-        up, down = (made.radiance({name: base + way * (base > 0.0)}, 3, 1024).sum() for way in (step, -step))
-        gradient = made.adjoint({name: base}, ones, 7, 1024)[name][base > 0.0]
+        base = made.get_base_value(name)
+        up, down = (made.render_radiance({name: base + way * (base > 0.0)}, 3, 1024).sum() for way in (step, -step))
+        gradient = made.render_adjoint({name: base}, ones, 7, 1024)[name][base > 0.0]
         assert float(gradient.sum()) == pytest.approx(float(up - down) / (2.0 * step), rel=0.03)
 
 
@@ -373,12 +375,12 @@ def test_many_dim_surfaces_do_not_take_the_samples_of_the_environment(tmp_path: 
         dot = card(vertices=CORNERS * 0.01 + [0.1 * number, 0, 2.0])
         dot.visual.material = scene.geometry["geometry_0"].visual.material
         scene.add_geometry(dot, node_name=f"dot{number}")
-    described = describe(f"{written(tmp_path, scene, 0.1)}#wall", "studio", given=SEEN)
-    weights = sampling_weights(described.meshes.values())
+    described = load_description(f"{written(tmp_path, scene, 0.1)}#wall", "studio", given=SEEN)
+    weights = compute_sampling_weights(described.meshes.values())
     assert len(weights) == 30 and sum(weights.values()) == pytest.approx(1.0)
 
     def noise(one: SceneDescription) -> float:
         made = MitsubaScene(one, (SIZE, SIZE), max_depth=2)
-        return float(torch.stack([made.radiance({}, seed, 16) for seed in range(8)]).std(dim=0).mean())
+        return float(torch.stack([made.render_radiance({}, seed, 16) for seed in range(8)]).std(dim=0).mean())
 
     assert noise(described) < 1.6 * noise(replace(described, parts=()))

@@ -15,16 +15,16 @@ from advsearch.controls import EnvironmentControl, make_space
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Material
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.formation import (
-    METERED_WHITE,
-    WHITE,
-    irradiance,
-    metered_gain,
-    visible_normals,
+    CARD_DISPLAY_VALUE,
+    CARD_REFLECTANCE,
+    compute_irradiance,
+    compute_metered_gain,
+    compute_visible_normals,
 )
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.settings import resolve
+from advsearch.scene.settings import resolve_settings
 from covering import once_each
 
 GREY = 0.214
@@ -43,19 +43,19 @@ def grey_ball(environment: EnvironmentAsset | str, **given: float) -> SceneDescr
     """A matt grey ball, whose rendered radiance an incident meter should foretell."""
     ball = library.load_object("ball")
     matt = replace(ball, base_color=np.full((4, 4, 3), 0.5, np.float32), material=Material(1.0, 0.0, 0.0, 0.0))
-    return describe(matt, environment, given={name.replace("__", "."): value for name, value in given.items()})
+    return load_description(matt, environment, given={name.replace("__", "."): value for name, value in given.items()})
 
 
 def test_under_uniform_light_the_card_gets_its_level() -> None:
     scene = grey_ball(EnvironmentAsset("uniform", np.full((64, 128, 3), 2.5, np.float32)), ground__size=0.0)
-    assert irradiance(scene, visible_normals(scene)) == pytest.approx(2.5 * math.pi, rel=0.01)
-    assert scene.gain * WHITE * 2.5 == pytest.approx(METERED_WHITE, rel=0.01)
+    assert compute_irradiance(scene, compute_visible_normals(scene)) == pytest.approx(2.5 * math.pi, rel=0.01)
+    assert scene.gain * CARD_REFLECTANCE * 2.5 == pytest.approx(CARD_DISPLAY_VALUE, rel=0.01)
 
 
 @pytest.mark.parametrize(("ev", "stops"), [(14.0, 0.0), (3.0, 0.0), (14.0, -1.5)])
 def test_an_exposure_value_says_which_luminance_is_white(ev: float, stops: float) -> None:
     """As docs/scenes.md has it: linear value = L / (1.2 * 2 ** ev) * 2 ** exposure, with L in cd/m2."""
-    scene = describe("car", "avenue", given={"camera.ev": ev, "camera.exposure": stops})
+    scene = load_description("car", "avenue", given={"camera.ev": ev, "camera.exposure": stops})
     assert scene.environment is not None and scene.environment.candelas is not None
     white = 1.2 * 2.0**ev / 2.0**stops  # cd/m2
     assert scene.gain * white / scene.environment.candelas == pytest.approx(1.0)
@@ -81,7 +81,7 @@ def test_what_is_metered_is_what_a_render_of_a_matt_ball_shows(environment: str,
     radiance = render.radiance(render.start, seed=0, spp=32)
     y, x = torch.meshgrid(torch.arange(32) - 15.5, torch.arange(32) - 15.5, indexing="ij")
     seen = float(radiance[(x**2 + y**2) < 12.5**2].mean())
-    metered = float(irradiance(scene, visible_normals(scene)).mean())
+    metered = float(compute_irradiance(scene, compute_visible_normals(scene)).mean())
     assert GREY / math.pi * metered == pytest.approx(seen, rel=0.2)  # shadows and bounces take no part
 
 
@@ -116,7 +116,7 @@ def test_a_setting_a_fixed_value_and_a_point_of_a_grid_are_one_picture(
 ) -> None:
     value, (kind, _, name) = CHANGED[parameter], parameter.partition(".")
     searched: dict[str, dict[str, object]] = {"corruption": {"severity": [0.0, 1.0]}}
-    grid = {kind: {name: {"choices": [resolve({})[parameter] or 0.1, value]}}}
+    grid = {kind: {name: {"choices": [resolve_settings({})[parameter] or 0.1, value]}}}
     renders = [
         load_scene("hammer", settings={parameter: value}).renderer(searched, resolution=size),
         load_scene("hammer").renderer({kind: {name: value}, **searched}, resolution=size),
@@ -144,7 +144,7 @@ def _at_second(renders: list[Renderer]) -> list[Tensor]:
 
 
 def test_the_objects_colour_and_what_comes_after_metering_take_no_part() -> None:
-    scene = describe("mug")
+    scene = load_description("mug")
     black = replace(scene, object=replace(scene.object, base_color=np.zeros((4, 4, 3), np.float32)))
     assert black.gain == scene.gain
     assert scene.with_values(camera__exposure=1.0).gain == pytest.approx(2.0 * scene.gain)
@@ -154,16 +154,16 @@ def test_an_object_too_thin_to_be_seen_leaves_the_card_on_the_ground() -> None:
     scene = grey_ball("noon")
     needle = replace(scene.object.mesh, vertices=scene.object.mesh.vertices * np.array([1e-5, 1e-5, 1.0], np.float32))
     scene = replace(scene, object=replace(scene.object, mesh=needle))
-    assert len(visible_normals(scene)) == 0
-    up = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean())
-    assert metered_gain(scene) == pytest.approx(METERED_WHITE * math.pi / (WHITE * up))
+    assert len(compute_visible_normals(scene)) == 0
+    up = float(compute_irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean())
+    assert compute_metered_gain(scene) == pytest.approx(CARD_DISPLAY_VALUE * math.pi / (CARD_REFLECTANCE * up))
 
 
 def test_another_environment_keeps_the_exposure_it_would_be_loaded_with() -> None:
-    scene = describe("mug", "studio")
+    scene = load_description("mug", "studio")
     space = make_space([EnvironmentControl(which=["own", "noon"])], scene)
     own, noon = (space.inputs(torch.tensor([u]))["environment.data"] * scene.gain for u in (0.25, 0.75))
-    loaded = describe("mug", "noon")
+    loaded = load_description("mug", "noon")
     assert scene.environment is not None and loaded.environment is not None
     assert torch.equal(own, torch.from_numpy(scene.environment.radiance) * scene.gain)
     torch.testing.assert_close(noon, torch.from_numpy(loaded.environment.radiance) * loaded.gain, rtol=1e-4, atol=1e-6)

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from advsearch import load_scene, threads
-from advsearch.engine.gradients import smooth_loss
+from advsearch.engine.gradients import make_smooth_loss
 from advsearch.errors import InputError
 from advsearch.questions.stability.scene import make_renderer, render_image
 from advsearch.scene.assets import EnvironmentAsset
@@ -53,7 +53,7 @@ def test_extremes_are_finite(name: str) -> None:
     with torch.no_grad():
         picture = render(u, seed=0, spp=2)
     assert bool(torch.isfinite(picture).all()) and float(picture.min()) >= 0.0 and float(picture.max()) <= 1.0
-    _, gradient = render.gradient(smooth_loss((SIZE, SIZE)), u, 0, 2)
+    _, gradient = render.gradient(make_smooth_loss((SIZE, SIZE)), u, 0, 2)
     assert bool(torch.isfinite(gradient).all())
     assert render.non_finite == 0
 
@@ -62,7 +62,7 @@ def test_extremes_are_finite(name: str) -> None:
 def test_adjoints_of_poses_are_finite_at_any_scale(scale: float) -> None:
     controls = {"pose": {"yaw": [0, 360], "scale": scale}}
     render = load_scene("mug").renderer(controls, resolution=SIZE, denoise="none", estimators={"pose": "material"})
-    _, gradient = render.gradient(smooth_loss((SIZE, SIZE)), render.start, 0, 2)
+    _, gradient = render.gradient(make_smooth_loss((SIZE, SIZE)), render.start, 0, 2)
     assert bool(torch.isfinite(gradient).all())
 
 
@@ -75,7 +75,7 @@ def test_one_texel_of_a_hundred_thousand_is_finite() -> None:
     u[0] = 0.31
     with torch.no_grad():
         assert bool(torch.isfinite(render(u, seed=0, spp=2)).all())
-    _, gradient = render.gradient(smooth_loss((SIZE, SIZE)), u, 0, 2)
+    _, gradient = render.gradient(make_smooth_loss((SIZE, SIZE)), u, 0, 2)
     assert bool(torch.isfinite(gradient).all()) and bool(gradient.any())
 
 
@@ -116,7 +116,7 @@ def rendered(path: str, count: int) -> None:
     Of the 40 pictures of a moved mesh: that their last bits differ is a matter of chance.
     """
     threads.configure(count)
-    loss = smooth_loss((SIZE, SIZE))
+    loss = make_smooth_loss((SIZE, SIZE))
     raw, denoised = make_renderer({"texture": {"resolution": 16}}), make_renderer(SHIFT, denoise="oidn")
     arrays = {"raw": render_image(raw, raw.start, 0, 8), "denoised": render_image(denoised, denoised.start, 0, 8)}
     arrays["moved"] = torch.stack([render_image(denoised, place[None], 0, 8) for place in torch.linspace(0.1, 0.9, 40)])

@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 import torch
 
-from advsearch.engine.acceptance import ACCEPTED, Deviation, levels_off, view_of
-from advsearch.engine.gradients import smooth_loss
-from advsearch.questions.stability.result import Outcome, check, holds
+from advsearch.engine.acceptance import ACCEPTED_FRACTION, Deviation, compare_with_traced, compute_level_errors
+from advsearch.engine.gradients import make_smooth_loss
+from advsearch.questions.stability.result import Outcome, check_condition, check_range
 from advsearch.questions.stability.scene import (
     REFERENCE_SPP,
     ControlSettings,
-    Thing,
+    ObjectSource,
     make_checkered_mug,
-    make_grey_map,
+    make_gray_environment,
     make_renderer,
     measure_inward_slope,
     render_image,
 )
 from advsearch.questions.stability.scenes import FLASH, TEXTURE, make_glass_ball
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.surface.renderer import SurfaceRenderer, why_not
+from advsearch.scene.surface.renderer import SurfaceRenderer, find_refusal
 from advsearch.scene.transport.lights import BasisRenderer
 from advsearch.scene.transport.matrix import LinearRenderer
 
@@ -32,7 +32,7 @@ TRACED = 256
 OFF = 0.15
 """Root mean square error of a predicted change, as a share of the change: noise of the matrix, and light that meets the
 texture twice."""
-NIGHT = make_grey_map(0.0)
+NIGHT = make_gray_environment(0.0)
 
 
 def right(outcome: Outcome) -> None:
@@ -42,7 +42,7 @@ def right(outcome: Outcome) -> None:
 
 def predicted(
     controls: ControlSettings = TEXTURE,
-    thing: Thing = "mug",
+    thing: ObjectSource = "mug",
     *,
     epsilon: float = 0.1,
     off: float = OFF,
@@ -60,11 +60,11 @@ def predicted(
     size = float(traced.square().mean().sqrt())
     error = float((change - traced).square().mean().sqrt()) / size if size else float(change.abs().max())
     checks = [
-        check("error of the predicted change, as a share of it", error, most=off),
-        holds("the derivative is there where the picture changes", bool(slope.any()) == (size > 0.0)),
+        check_range("error of the predicted change, as a share of it", error, most=off),
+        check_condition("the derivative is there where the picture changes", bool(slope.any()) == (size > 0.0)),
     ]
     finite = bool(torch.isfinite(change).all() and torch.isfinite(slope).all()) and linear.non_finite == 0
-    return Outcome(checks, finite, error, measured={"entries": float(linear.entries), "rms change": size})
+    return Outcome(checks, finite, error, measured={"entries": float(linear.n_entries), "rms change": size})
 
 
 MIRROR = {"material.roughness": 0.0, "material.metallic": 1.0}
@@ -116,8 +116,8 @@ def test_a_lamp_that_goes_out_is_predicted() -> None:
     error = float((change - traced).norm() / traced.norm())
     finite = all(bool(torch.isfinite(values).all()) for values in (change, black, slope))
     checks = [
-        check("error of the predicted change, as a share of it", error, most=OFF),
-        holds("without any light the picture is black", bool((black == 0.0).all())),
+        check_range("error of the predicted change, as a share of it", error, most=OFF),
+        check_condition("without any light the picture is black", bool((black == 0.0).all())),
     ]
     right(Outcome(checks, finite, error))
 
@@ -132,7 +132,7 @@ PAINTED: ControlSettings = {"texture": {"resolution": 8}, "camera": {}}
 
 def lit(
     controls: ControlSettings = PAINTED,
-    thing: Thing = "mug",
+    thing: ObjectSource = "mug",
     *,
     levels: float = LEVELS,
     slope: float | None = 0.15,
@@ -149,31 +149,31 @@ def lit(
     light, u = SurfaceRenderer(renderer, renderer.start, seed=1), renderer.start
     with torch.no_grad():
         picture = light(u)
-    (off,) = levels_off(renderer, [picture], u, 3, TRACED)
+    (off,) = compute_level_errors(renderer, [picture], u, 3, TRACED)
     textured = torch.zeros(len(u))
     for group in renderer.space.groups:
         textured[group.coordinates] = float(group.control == "texture")
-    light.traced = renderer.like(transfer="linear")
-    gradient = light.renderer.gradient(smooth_loss(renderer.formation.resolution), u, 0, 1)[1] * textured
+    light.path_renderer = renderer.copy_with(transfer="linear")
+    gradient = light.renderer.gradient(make_smooth_loss(renderer.formation.resolution), u, 0, 1)[1] * textured
     given, wanted = measure_inward_slope(renderer, gradient, textured, 1, 4 * REFERENCE_SPP)
     error = abs(given / wanted - 1.0) if wanted else abs(given)
     seen = (
-        check("largest derivative by a texel", float(gradient.abs().max()), 0.0, 0.0)
+        check_range("largest derivative by a texel", float(gradient.abs().max()), 0.0, 0.0)
         if slope is None
-        else check("error of the derivative by the texture", error, most=slope)
+        else check_range("error of the derivative by the texture", error, most=slope)
     )
     hidden = textured * (gradient == 0.0)
-    light.traced = renderer
+    light.path_renderer = renderer
     with torch.no_grad():
         unseen = float((light(u * (1.0 - hidden)) - picture).abs().max())
     checks = [
-        holds("the picture is in [0, 1]", bool((picture >= 0.0).all() and (picture <= 1.0).all())),
-        check("levels of 255 off", off, most=levels),
+        check_condition("the picture is in [0, 1]", bool((picture >= 0.0).all() and (picture <= 1.0).all())),
+        check_range("levels of 255 off", off, most=levels),
         seen,
-        check("largest change where texels without a derivative become black", unseen, 0.0, 0.0),
+        check_range("largest change where texels without a derivative become black", unseen, 0.0, 0.0),
     ]
     finite = bool(torch.isfinite(picture).all() and torch.isfinite(gradient).all()) and light.non_finite == 0
-    measured = {"entries": float(light.entries), "derivative": wanted, "hidden numbers": float(hidden.sum())}
+    measured = {"entries": float(light.n_entries), "derivative": wanted, "hidden numbers": float(hidden.sum())}
     return Outcome(checks, finite, error, measured=measured)
 
 
@@ -191,7 +191,7 @@ LIT: list[tuple[str, str, dict[str, Any]]] = [
     ("lit-unseen-texels", "Texels that the view does not meet have a derivative of 0, and change nothing.", {}),
     ("lit-map-half-black", "A map that is half black and half white is predicted.",
      {"environment": EnvironmentAsset("half", HALF), "levels": 1.5 * LEVELS}),
-    ("lit-map-white", "A map that is white everywhere is predicted.", {"environment": make_grey_map(1.0)}),
+    ("lit-map-white", "A map that is white everywhere is predicted.", {"environment": make_gray_environment(1.0)}),
     ("lit-map-black", "The picture is black, the derivative 0.", {"environment": NIGHT, "slope": None, "levels": 1e-6}),
     ("lit-sun", "A sun of one texel, 300,000 times as bright as the sky, casts the shadow that is traced.",
      {"environment": FLASH, "levels": 1.5 * LEVELS}),
@@ -214,10 +214,15 @@ def test_a_mirror_is_too_far_off_and_the_comparison_says_so() -> None:
         renderer = make_renderer(PAINTED, settings=settings, denoise="oidn")
         with torch.no_grad():
             picture = SurfaceRenderer(renderer, renderer.start, seed=1)(renderer.start)
-        off.append(Deviation.of([view_of(renderer, picture, renderer.start, 3, 8, lambda *at: 0.0)]).share / ACCEPTED)
+        off.append(
+            Deviation.from_views(
+                [compare_with_traced(renderer, picture, renderer.start, 3, 8, lambda *at: 0.0)]
+            ).levels_fraction
+            / ACCEPTED_FRACTION
+        )
     checks = [
-        check("of a mirror, levels off as a share of what is accepted", off[0], least=1.5),
-        check("of the mug as it is", off[1], most=1.0),
+        check_range("of a mirror, levels off as a share of what is accepted", off[0], least=1.5),
+        check_range("of the mug as it is", off[1], most=1.0),
     ]
     right(Outcome(checks))
 
@@ -225,11 +230,14 @@ def test_a_mirror_is_too_far_off_and_the_comparison_says_so() -> None:
 @pytest.mark.medium
 def test_what_stands_behind_glass_is_refused() -> None:
     """An object behind clear glass is refused in words."""
-    reason = why_not(make_renderer(PAINTED, plugins=make_glass_ball()), ["camera"])
+    reason = find_refusal(make_renderer(PAINTED, plugins=make_glass_ball()), ["camera"])
     checks = [
-        holds("it says that there is more in the scene", reason is not None and "more in the scene" in reason.text),
-        holds(
-            "without the glass it is not refused", why_not(make_renderer(PAINTED, denoise="oidn"), ["camera"]) is None
+        check_condition(
+            "it says that there is more in the scene", reason is not None and "more in the scene" in reason.text
+        ),
+        check_condition(
+            "without the glass it is not refused",
+            find_refusal(make_renderer(PAINTED, denoise="oidn"), ["camera"]) is None,
         ),
     ]
     right(Outcome(checks))

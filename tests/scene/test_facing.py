@@ -15,13 +15,13 @@ from test_gltf import File
 import advsearch
 from advsearch.cli.main import _join_negative_axis
 from advsearch.controls.camera import CameraControl
-from advsearch.engine.loading import load_scene, scene_as_settings
+from advsearch.engine.loading import load_scene, scene_to_settings
 from advsearch.errors import InputError
 from advsearch.questions.replay.cycles import _turn_for_blender
 from advsearch.scene import library
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.glb import glb
+from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import import_scene
 from advsearch.scene.parts import MeshPart
@@ -130,7 +130,7 @@ def test_a_name_or_a_label_does_not_decide_which_side_a_dashcam_sees(tmp_path: P
             assert sum("its front is taken to face" in note for note in scene.notes) == 1
     told = load_scene(str(tmp_path / "wcar.obj"), "street", facing="-x", size=LONG)
     assert not any("front" in note for note in told.description.notes)
-    assert scene_as_settings(told)["facing"] == "-x"
+    assert scene_to_settings(told)["facing"] == "-x"
     studio = load_scene(str(tmp_path / "wcar.glb"), "studio").description
     assert not any("front" in note for note in studio.notes)
 
@@ -234,7 +234,7 @@ def file_vertices(data: bytes) -> np.ndarray:
 
 def test_a_bundled_car_is_written_with_its_front_at_z_and_read_again_as_it_was(tmp_path: Path) -> None:
     car = library.load_object("car")
-    data = glb([car])
+    data = encode_glb([car])
     written = file_vertices(data)
     lamps = np.unique(car.mesh.faces[car.mesh.materials["headlight"]])
     assert written[lamps, 2].min() > 0.3  # of 1, its length
@@ -249,7 +249,7 @@ def test_a_bundled_car_is_written_with_its_front_at_z_and_read_again_as_it_was(t
 def test_blender_gets_our_axes() -> None:
     """Blender reads (x, y, z) of a glTF file as (x, -z, y)."""
     car = library.load_object("car")
-    x, y, z = file_vertices(glb([_turn_for_blender(car)])).T
+    x, y, z = file_vertices(encode_glb([_turn_for_blender(car)])).T
     np.testing.assert_allclose(np.stack([x, -z, y], axis=1), car.mesh.vertices, atol=1e-7)
 
 

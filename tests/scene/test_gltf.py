@@ -19,11 +19,11 @@ import advsearch
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import EnvironmentAsset, Material
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.gltf_parts import EDGES
+from advsearch.scene.importing.gltf_parts import EDGES_NOTE
 from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.parts import ImportedPart
-from advsearch.scene.importing.pictures import display_image
-from advsearch.scene.importing.texture import filtered, sampled
+from advsearch.scene.importing.pictures import load_display_image
+from advsearch.scene.importing.texture import sample_colors, sample_texture
 
 REPEAT, MIRRORED, CLAMPED, NEAREST, LINEAR = 10497, 33648, 33071, 9728, 9729
 TYPES = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
@@ -269,7 +269,7 @@ def test_vertex_colors_are_interpolated_in_linear_light(kind: str, width: int, t
     share = np.random.default_rng(0).dirichlet([1.0] * 3, 50)
     for face in asset.mesh.faces:
         x = share @ (asset.mesh.vertices[face, 1] + 0.5)
-        got = srgb_to_linear(sampled(asset.base_color, share @ asset.mesh.uvs[face].astype(np.float64)))
+        got = srgb_to_linear(sample_texture(asset.base_color, share @ asset.mesh.uvs[face].astype(np.float64)))
         assert got == pytest.approx(np.repeat(x[:, None], 3, axis=1), abs=0.01)
 
 
@@ -328,7 +328,7 @@ def test_a_transform_of_textures_is_applied_as_in_the_example_of_the_extension(t
     file.primitive(attributes=held)
     (part,), notes = parts_of(file, tmp_path)
     assert notes == [] and part.uvs is not None and part.surface.texture is not None
-    got = sampled(part.surface.texture, part.uvs)[:, 0] * 255  # bottom left, bottom right, top right, top left
+    got = sample_texture(part.surface.texture, part.uvs)[:, 0] * 255  # bottom left, bottom right, top right, top left
     assert got == pytest.approx([100, 150, 200, 255]) or got == pytest.approx([100, 150, 200, 255][::-1])
     assert part.uvs == pytest.approx(np.array([[0.4375, 0.0625], [0.4375, 0.4375], [0.0625, 0.4375], [0.0625, 0.0625]]))
 
@@ -418,7 +418,7 @@ def test_pictures_of_all_kinds_are_colours_as_they_are_stored(name: str, tmp_pat
 
 def test_the_mean_of_a_large_picture_is_that_of_its_light() -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (8, 8, 4), np.uint8)
-    got = display_image(Image.fromarray(pixels), 4, alpha=True)
+    got = load_display_image(Image.fromarray(pixels), 4, keep_alpha=True)
     light, share = srgb_to_linear(pixels[..., :3] / np.float32(255)), pixels[..., 3:] / 255
     sums = [(one.reshape(4, 2, 4, 2, -1)).sum(axis=(1, 3)) for one in (light * share, share)]
     assert got[..., :3] == pytest.approx(linear_to_srgb((sums[0] / sums[1]).astype(np.float32)), abs=1e-5)
@@ -529,7 +529,7 @@ def test_whatever_a_file_has_is_read_right_or_named(data: some.DataObject) -> No
         (numbers.get("metallicFactor", 1.0), numbers.get("roughnessFactor", 1.0))
     )
     assert area(part) == pytest.approx([0.0, 0.0, 1.0]) and (part.normals is None) == ("NORMAL" not in held)
-    if filter == NEAREST and any(EDGES.strip() in note for note in notes):
+    if filter == NEAREST and any(EDGES_NOTE.strip() in note for note in notes):
         return  # enlarged for its hard edges, the picture had no room for what lies far beyond them, which is said
     assert part.flat and part.uvs is not None and not notes
     light = srgb_to_linear(pixels / np.float32(255.0)).astype(np.float64)
@@ -548,7 +548,7 @@ def test_whatever_a_file_has_is_read_right_or_named(data: some.DataObject) -> No
                 continue  # at a border
             wanted = wanted * reference(light, at[0], at[1], wraps, sharp=filter == NEAREST)
             assert part.surface.texture is not None
-            got = got * srgb_to_linear(filtered(part.surface.texture, (share @ inside)[None])[0])
+            got = got * srgb_to_linear(sample_colors(part.surface.texture, (share @ inside)[None])[0])
         else:
             assert part.surface.color is not None
             got = got * srgb_to_linear(part.surface.color)

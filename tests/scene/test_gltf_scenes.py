@@ -14,7 +14,7 @@ import pytest
 from test_gltf import SQUARE, File
 
 from advsearch.errors import FileFormatError, InputError
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.scenes import LUMENS, import_scene
@@ -43,7 +43,7 @@ def with_camera(folder: Path, lens: dict[str, float], **node: Any) -> SceneDescr
     file = square()
     file.header["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.8, **lens}, "name": "front"}]
     add(file, camera=0, translation=[0.5, 0.5, 2.0], **node)
-    return describe(f"{file.write(folder)}#plate").seen_by("front")
+    return load_description(f"{file.write(folder)}#plate").with_camera("front")
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 2.0])
@@ -109,7 +109,7 @@ def test_candela_and_nit_are_of_one_kind(generator: str, shines: bool, candela: 
     lights = [{"type": "point", "intensity": 39.27}]
     file.header["extensions"] = {"KHR_lights_punctual": {"lights": lights}}
     add(file, translation=[0.5, 0.5, 1.0], extensions={"KHR_lights_punctual": {"light": 0}})
-    scene = describe(f"{file.write(tmp_path)}#plate")
+    scene = load_description(f"{file.write(tmp_path)}#plate")
     (lamp,) = scene.lamps.values()
     assert isinstance(lamp, PointLamp)
     assert lamp.intensity[0] == pytest.approx(39.27 / candela)  # the plate's side is the unit

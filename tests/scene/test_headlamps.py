@@ -12,14 +12,14 @@ import torch
 
 import advsearch
 from advsearch.controls import Space
-from advsearch.engine.loading import Scene, framed, make_renderer
+from advsearch.engine.loading import Scene, fit_camera, make_renderer
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.grounds import LUMINANCE
-from advsearch.scene.headlamps import CUT_OFF, EGO, GLASS, REAR, candela
+from advsearch.scene.headlamps import CUT_OFF, EGO_LAMP_POSITION, HEADLAMP_CANDELA, TAILLAMP_CANDELA, compute_candela
 from advsearch.scene.library import load_object
-from advsearch.scene.mitsuba_backend.parts import translation
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.parts import translate_part
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene
 from advsearch.scene.parts import BeamLamp, LampGlass
 from advsearch.scene.renderer import Renderer
@@ -39,7 +39,7 @@ def glasses(scene: SceneDescription) -> dict[str, LampGlass]:
 
 
 def intensity(kind: str, h: float, v: float) -> float:
-    return float(candela(kind, np.array(h), np.array(v)))
+    return float(compute_candela(kind, np.array(h), np.array(v)))
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def intensity(kind: str, h: float, v: float) -> float:
 def test_a_low_beam_has_what_a_regulation_asks_for(v: float, h: float, least: float, most: float) -> None:
     """UN Regulation 112, section 6.2.4, a lamp of class B, with what its glass adds; its 75 R lies above a level
     cut-off."""
-    assert least <= intensity("low", h, v) and intensity("low", h, v) + GLASS <= most
+    assert least <= intensity("low", h, v) and intensity("low", h, v) + HEADLAMP_CANDELA <= most
 
 
 def test_a_high_beam_has_what_a_regulation_asks_for() -> None:
@@ -68,14 +68,14 @@ def test_a_high_beam_has_what_a_regulation_asks_for() -> None:
 @pytest.mark.parametrize("kind", ["low", "high"])
 def test_a_wall_is_lit_by_the_beam_as_its_formula_says(kind: str) -> None:
     """A wall 25 m ahead of one lamp, 0.5 white: radiance = 0.5 / pi I cos / d^2, and the cut-off 25 cm below."""
-    mi = mitsuba()
+    mi = import_mitsuba()
     lamp = next(one for one in beams(scene(**{"object.lamps": kind}).description) if "left" in one.name)
     seat = np.eye(4)
     seat[:3, :3] = lamp.seat[:3, :3]
     lamp = BeamLamp("lamp", "", seat, lamp.table, (1.0, 1.0, 1.0), to_world=seat)
     view = mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[1, 0, -0.02], up=[0, 0, 1])
     made = mi.load_dict({
-        "type": "scene", "lamp": translation(lamp).plugins["lamp"], "integrator": {"type": "prb", "max_depth": 2},
+        "type": "scene", "lamp": translate_part(lamp).plugins["lamp"], "integrator": {"type": "prb", "max_depth": 2},
         "wall": {
             "type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
             "to_world": mi.ScalarTransform4f().look_at(origin=[25, 0, 0], target=[0, 0, 0], up=[0, 0, 1]).scale(40),
@@ -95,7 +95,7 @@ def test_a_wall_is_lit_by_the_beam_as_its_formula_says(kind: str) -> None:
     far = np.linalg.norm(ahead, axis=-1)
     h = np.degrees(np.arctan2(ahead[..., 1], ahead[..., 0]))
     v = np.degrees(np.arcsin(ahead[..., 2] / far))
-    expected = 0.5 / np.pi * candela(kind, h, v) * 25.0 / far**3
+    expected = 0.5 / np.pi * compute_candela(kind, h, v) * 25.0 / far**3
     bright = expected > 0.05 * expected.max()
     smooth = bright & (np.abs(v - CUT_OFF) > 0.3)
     np.testing.assert_allclose(rendered[smooth], expected[smooth], rtol=0.02)
@@ -111,7 +111,7 @@ def scene(environment: str = "avenue-night", things: str | None = None, **given:
 
 
 def rendered(made: Scene, side: int) -> Renderer:
-    return make_renderer(framed(made.description, side), Space(()), side, "none", 0)
+    return make_renderer(fit_camera(made.description, side), Space(()), side, "none", 0)
 
 
 @pytest.mark.medium
@@ -127,19 +127,19 @@ def test_the_ground_ahead_has_the_lux_of_both_headlamps() -> None:
     seen, described = renderer.surfaces(renderer.start), lit.description
     camera, right = (lamp.to_world for lamp in beams(described))
     place = 0.5 * (camera + right)[:3, 3] * described.metres
-    assert place[2] == pytest.approx(EGO[2]) and camera[:3, 2] == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
-    eye = place - [EGO[0], 0.0, EGO[2] - 1.3]
+    assert place[2] == pytest.approx(EGO_LAMP_POSITION[2]) and camera[:3, 2] == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
+    eye = place - [EGO_LAMP_POSITION[0], 0.0, EGO_LAMP_POSITION[2] - 1.3]
     # from depth to places: the picture's rows are at known angles below the camera's axis, its middle column ahead
     depth = seen.depth.numpy()[:, 47:49].mean(axis=1)  # metres
-    rows = np.flatnonzero(seen.seen("ground").numpy()[:, 47:49].all(axis=1) & (depth < 22.0) & (depth > 4.5))
+    rows = np.flatnonzero(seen.visible_mask("ground").numpy()[:, 47:49].all(axis=1) & (depth < 22.0) & (depth > 4.5))
     assert len(rows) > 15
     x = eye[0] + np.sqrt(depth[rows] ** 2 - 1.3**2)
     lux = np.zeros(len(rows))
-    for side in (EGO[1], -EGO[1]):
-        way = np.stack([x - place[0], 0.0 * x - side, 0.0 * x - EGO[2]], axis=1)
+    for side in (EGO_LAMP_POSITION[1], -EGO_LAMP_POSITION[1]):
+        way = np.stack([x - place[0], 0.0 * x - side, 0.0 * x - EGO_LAMP_POSITION[2]], axis=1)
         far = np.linalg.norm(way, axis=1)
         h, v = np.degrees(np.arctan2(way[:, 1], way[:, 0])), np.degrees(np.arcsin(way[:, 2] / far))
-        lux += candela("low", h, v) * EGO[2] / far**3
+        lux += compute_candela("low", h, v) * EGO_LAMP_POSITION[2] / far**3
     albedo = ((0.5 + 0.055) / 1.055) ** 2.4
     assert described.environment is not None and described.environment.candelas is not None
     measured = (found[0] - found[1])[rows, 47:49].mean(axis=1) * described.environment.candelas
@@ -174,7 +174,10 @@ def test_lamps_sit_where_the_car_has_its_glass() -> None:
 def test_glass_shines_as_many_candela_as_it_says_and_rear_lamps_are_red() -> None:
     described = scene(**LOW).description
     assert described.environment is not None and described.environment.candelas is not None
-    for name, candelas, way in (("object-headlamps", GLASS, 1.0), ("object-taillamps", REAR, -1.0)):
+    for name, candelas, way in (
+        ("object-headlamps", HEADLAMP_CANDELA, 1.0),
+        ("object-taillamps", TAILLAMP_CANDELA, -1.0),
+    ):
         part = glasses(described)[name]
         corners = (part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T)[part.mesh.faces] * described.metres
         area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 0] * way / 2.0
@@ -191,8 +194,8 @@ def test_rear_lamps_are_seen_red_and_headlamps_white() -> None:
         lit = scene(**{**FRONT, **LOW, "camera.azimuth": azimuth})
         renderer = rendered(lit, 64)
         shown = renderer(renderer.start, 0, 16).numpy()
-        seen, on = renderer.surfaces(renderer.start), torch.from_numpy(glasses(lit.description)[glass].lies_on)
-        there = (seen.seen("object") & torch.isin(seen.face, on)).numpy()
+        seen, on = renderer.surfaces(renderer.start), torch.from_numpy(glasses(lit.description)[glass].face_of_carrier)
+        there = (seen.visible_mask("object") & torch.isin(seen.face, on)).numpy()
         assert there.sum() >= 4, glass
         red, green, blue = shown[there].mean(axis=0)
         assert red > 0.9 and (max(green, blue) < 0.35 if azimuth else min(green, blue) > 0.9), glass
@@ -202,9 +205,9 @@ def test_rear_lamps_are_seen_red_and_headlamps_white() -> None:
 def test_glass_belongs_to_its_car() -> None:
     lit, dark = (rendered(scene(**FRONT, **one), 100) for one in (LOW, {}))
     seen, plain = lit.surfaces(lit.start), dark.surfaces(dark.start)
-    assert not bool(seen.seen("object-headlamps").any())
-    assert int((seen.seen("object") != plain.seen("object")).sum()) <= 2
-    there = seen.seen("object") & plain.seen("object")
+    assert not bool(seen.visible_mask("object-headlamps").any())
+    assert int((seen.visible_mask("object") != plain.visible_mask("object")).sum()) <= 2
+    there = seen.visible_mask("object") & plain.visible_mask("object")
     assert float((seen.face == plain.face)[there].float().mean()) > 0.95
     assert float((seen.uv - plain.uv).abs().amax(dim=2)[there].quantile(0.99)) < 0.02
 
@@ -244,7 +247,7 @@ def test_a_car_whose_file_names_no_lamps_has_two_before_it_and_two_behind(tmp_pa
     quads = [(1, 3, 4, 2), (5, 6, 8, 7), (1, 2, 6, 5), (3, 7, 8, 4), (1, 5, 7, 3), (2, 4, 8, 6)]
     lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {' '.join(map(str, one))}" for one in quads]
     (tmp_path / "car.obj").write_text("\n".join(lines))
-    described = describe(str(tmp_path / "car.obj"), "avenue-night", given=LOW, up="z", size=4.0)
+    described = load_description(str(tmp_path / "car.obj"), "avenue-night", given=LOW, up="z", size=4.0)
     front, rear = (glasses(described)[f"object-{one}"] for one in ("headlamps", "taillamps"))
     for part, x, z in ((front, 2.0, 0.63), (rear, -2.0, 0.84)):
         places = (part.mesh.vertices @ part.to_world[:3, :3].T + part.to_world[:3, 3]) * described.metres
@@ -279,12 +282,12 @@ def test_what_cannot_shine_is_refused(words: dict[str, Any], error: type[InputEr
 
 def test_an_object_without_metres_has_no_lamps() -> None:
     with pytest.raises(InputError, match="so many metres apart"):
-        describe(replace(load_object("mug"), metres=None), "avenue-night", given={"camera.lamps": "low"})
+        load_description(replace(load_object("mug"), metres=None), "avenue-night", given={"camera.lamps": "low"})
 
 
 @pytest.mark.medium
 def test_an_exported_scene_has_the_same_lamps(tmp_path: Path) -> None:
-    mi = mitsuba()
+    mi = import_mitsuba()
     renderer = rendered(scene(**FRONT, **LOW, **{"camera.lamps": "low"}), 32)
     file = tmp_path / "scene.xml"
     write_scene(renderer.scene, {}, file, "")

@@ -26,8 +26,8 @@ from advsearch.scene.assets import Material, Mesh, ObjectAsset
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import objects
 from advsearch.scene.importing.objects import guess_up, import_object
-from advsearch.scene.importing.pictures import area_average, display_image
-from advsearch.scene.importing.texture import filtered, sampled
+from advsearch.scene.importing.pictures import average_area, load_display_image
+from advsearch.scene.importing.texture import sample_colors, sample_texture
 from fuzz.pictures import plain_png
 
 DATA = conftest.DATA / "objects"
@@ -101,7 +101,7 @@ def color_at(asset: ObjectAsset, points: np.ndarray) -> np.ndarray:
     """Return the base colour at the face whose centre is nearest to each of the points (N, 3)."""
     centres = asset.mesh.vertices[asset.mesh.faces].mean(axis=1)
     nearest = ((centres[None] - points[:, None]) ** 2).sum(axis=2).argmin(axis=1)
-    return sampled(asset.base_color, asset.mesh.uvs[asset.mesh.faces[nearest]].mean(axis=1).astype(np.float64))
+    return sample_texture(asset.base_color, asset.mesh.uvs[asset.mesh.faces[nearest]].mean(axis=1).astype(np.float64))
 
 
 def check_sound(asset: ObjectAsset) -> None:
@@ -430,7 +430,9 @@ def texture_error(asset: ObjectAsset, pixels: np.ndarray, low: tuple[float, floa
         for weights in np.random.default_rng(0).dirichlet([2.0, 2.0, 2.0], 200):
             at, uv = weights @ (mesh.vertices[face][:, :2] + 0.5), weights @ mesh.uvs[face]
             there = np.array(low) + at * (np.array(high) - low)
-            errors.append(np.abs(sampled(asset.base_color, uv[None]) - sampled(pixels, there[None])).max())
+            errors.append(
+                np.abs(sample_texture(asset.base_color, uv[None]) - sample_texture(pixels, there[None])).max()
+            )
     found: float = max(errors)
     return found
 
@@ -506,7 +508,7 @@ def test_large_textures_are_averaged_down(tmp_path: Path, width: int, height: in
     stripes = np.zeros((height, width, 3), np.uint8)
     stripes[::2] = 255
     Image.fromarray(stripes).save(tmp_path / "wood.png", compress_level=1)
-    got = display_image(Image.open(tmp_path / "wood.png"))
+    got = load_display_image(Image.open(tmp_path / "wood.png"))
     assert got.shape == (*expected, 3)
     # black and white lines average to half of white's light, not to half of its code
     assert srgb_to_linear(got).mean() == pytest.approx(0.5, abs=1e-3)
@@ -514,7 +516,7 @@ def test_large_textures_are_averaged_down(tmp_path: Path, width: int, height: in
 
 def test_area_average_is_exact() -> None:
     image = np.random.default_rng(0).random((7, 9, 2), dtype=np.float32)
-    got = area_average(image, 3, 4)
+    got = average_area(image, 3, 4)
     assert got.mean(axis=(0, 1)) == pytest.approx(image.mean(axis=(0, 1)), rel=1e-6)
     weights = np.array([1.0, 1.0, 1 / 3])
     expected = np.einsum("i,ij,j->", weights, image[:3, :3, 0], np.array([1.0, 1.0, 0.25])) / (7 / 3 * 9 / 4)
@@ -524,11 +526,11 @@ def test_area_average_is_exact() -> None:
 def test_alpha_palettes_and_depths_of_pictures() -> None:
     rgba = np.full((2, 2, 4), 200, np.uint8)
     rgba[..., 3] = 0
-    assert display_image(Image.fromarray(rgba)) == pytest.approx(200 / 255)
-    assert display_image(Image.fromarray(rgba[..., :3]).convert("P")) == pytest.approx(200 / 255, abs=0.02)
-    assert display_image(Image.fromarray(np.full((2, 2), 32768, np.uint16))) == pytest.approx(0.5, abs=0.003)
-    assert display_image(Image.fromarray(np.full((2, 2), 0.25, np.float32))) == pytest.approx(0.25, abs=0.003)
-    assert display_image(Image.new("L", (3, 2), 255)).shape == (2, 3, 3)
+    assert load_display_image(Image.fromarray(rgba)) == pytest.approx(200 / 255)
+    assert load_display_image(Image.fromarray(rgba[..., :3]).convert("P")) == pytest.approx(200 / 255, abs=0.02)
+    assert load_display_image(Image.fromarray(np.full((2, 2), 32768, np.uint16))) == pytest.approx(0.5, abs=0.003)
+    assert load_display_image(Image.fromarray(np.full((2, 2), 0.25, np.float32))) == pytest.approx(0.25, abs=0.003)
+    assert load_display_image(Image.new("L", (3, 2), 255)).shape == (2, 3, 3)
 
 
 # --- materials ----------------------------------------
@@ -630,8 +632,8 @@ def test_several_materials_are_baked_into_one_texture(tmp_path: Path) -> None:
     top = asset.mesh.vertices[asset.mesh.faces][:, :, 2].min(axis=1) > 0.99
     for face in asset.mesh.faces[top]:  # the top's texture runs along x and y
         at, uv = asset.mesh.vertices[face].mean(axis=0)[:2] + 0.5, asset.mesh.uvs[face].mean(axis=0)
-        expected = filtered(pixels, at[None].astype(np.float64))
-        assert sampled(asset.base_color, uv[None].astype(np.float64)) == pytest.approx(expected, abs=0.03)
+        expected = sample_colors(pixels, at[None].astype(np.float64))
+        assert sample_texture(asset.base_color, uv[None].astype(np.float64)) == pytest.approx(expected, abs=0.03)
 
 
 def glb(folder: Path, material: PBRMaterial | None, **attributes: np.ndarray) -> Path:
@@ -1023,9 +1025,9 @@ def test_textures_have_a_limit_in_all(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_large_pictures_are_averaged_in_bands_to_the_same_values(monkeypatch: pytest.MonkeyPatch) -> None:
     image = Image.fromarray(np.random.default_rng(0).integers(0, 256, (1100, 1300, 3), np.uint8))
-    whole = display_image(image, 100)
+    whole = load_display_image(image, 100)
     monkeypatch.setattr("advsearch.scene.importing.pictures._BAND", 50_000)
-    assert np.array_equal(display_image(image, 100), whole)
+    assert np.array_equal(load_display_image(image, 100), whole)
 
 
 @pytest.mark.parametrize(
@@ -1054,10 +1056,10 @@ def test_faces_of_vertices_that_are_not_there(tmp_path: Path, index: str) -> Non
 
 
 def test_a_heap_of_faces_is_laid_out_in_a_grid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.scene.surface_parts._MOST_PATCHES", 8)
+    monkeypatch.setattr("advsearch.scene.surface_parts._MAX_PATCHES", 8)
     corners = np.random.default_rng(0).random((33, 3, 3))
     heap = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(99).reshape(-1, 3), process=False)
-    monkeypatch.setattr("advsearch.scene.surface_parts._MANY", 8)
+    monkeypatch.setattr("advsearch.scene.surface_parts._FACES_PER_ATLAS", 8)
     asset = import_object(exported(tmp_path, "heap.stl", heap))
     check_sound(asset)
     assert overlap(asset.mesh) == 0 and len(asset.mesh.faces) == 33
@@ -1364,7 +1366,7 @@ def test_real_banana_is_yellow_all_over() -> None:
     reduced = "banana.obj: the texture 'texture_map.png' of 4,096 x 4,096 texels is averaged down to 1,024 x 1,024"
     assert asset.warnings == (reduced,) and asset.base_color.shape == (1024, 1024, 3)
     uvs = asset.mesh.uvs[asset.mesh.faces].mean(axis=1).astype(np.float64)
-    red, green, blue = sampled(asset.base_color, uvs).T  # an upside-down texture would show its black background
+    red, green, blue = sample_texture(asset.base_color, uvs).T  # an upside-down texture would show its black background
     assert (np.minimum(red, green) > blue + 0.15).mean() > 0.95
 
 
@@ -1381,6 +1383,8 @@ def test_real_cow_is_the_same_from_both_formats() -> None:
 
 def test_a_huge_texture_coordinate_is_looked_up() -> None:
     texture = np.random.default_rng(0).random((4, 6, 3), dtype=np.float32)
-    assert np.isfinite(sampled(texture, np.array([[1e308, -1e308], [-1e308, 1.0]]))).all()
+    assert np.isfinite(sample_texture(texture, np.array([[1e308, -1e308], [-1e308, 1.0]]))).all()
     near = np.array([[0.3, 0.7]])
-    assert np.allclose(sampled(texture, near + np.array([[2.0, -3.0]])), sampled(texture, near), atol=1e-5)
+    assert np.allclose(
+        sample_texture(texture, near + np.array([[2.0, -3.0]])), sample_texture(texture, near), atol=1e-5
+    )

@@ -12,10 +12,10 @@ from torch import Tensor
 import advsearch
 from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
-from advsearch.scene.transport.lights import BasisRenderer, Span, lighting
+from advsearch.scene.transport.lights import BasisMaps, BasisRenderer, find_lighting
 from stand_ins import Impatient, rows
 
 SIZE = 32
@@ -68,11 +68,11 @@ def off(renderer: Renderer, predicted: BasisRenderer, u: Tensor) -> tuple[float,
 )
 def test_what_is_light(controls: Any, light: set[str], more: set[str]) -> None:
     made = rendered_by(controls)
-    found = lighting(made)
+    found = find_lighting(made)
     names = {group.name for group in made.plan.groups}
     assert light <= found.groups.keys() and not more & found.groups.keys()
     assert light | more <= names
-    assert bool(found.harmonic) == ("environment.harmonics" in light)
+    assert bool(found.harmonic_groups) == ("environment.harmonics" in light)
 
 
 @pytest.mark.medium
@@ -90,7 +90,7 @@ def test_a_sum_of_basis_pictures_is_the_traced_picture(
 def test_radiance_is_linear_in_power(predicted: BasisRenderer) -> None:
     none, half, whole = (predicted.renderer.radiance(torch.tensor([0.5, power, 0.5])) for power in (0.0, 0.5, 1.0))
     assert torch.allclose(whole - none, 2.0 * (half - none), atol=1e-5 * float(whole.max()))
-    assert predicted.lights == 2 and predicted.entries == 0
+    assert predicted.n_traced_images == 2 and predicted.n_entries == 0
 
 
 def test_its_derivative_is_that_of_its_pictures(predicted: BasisRenderer) -> None:
@@ -112,8 +112,8 @@ def test_its_derivative_is_that_of_its_pictures(predicted: BasisRenderer) -> Non
 def test_weights_are_those_of_the_nearest_map() -> None:
     maps = torch.rand(3, 6, 12, 3, generator=torch.Generator().manual_seed(0))
     weights = torch.tensor([[1.0, 0.5, 2.0], [-0.3, 0.0, 0.1], [0.0, 4.0, 0.2]])
-    span = Span(maps)
-    assert torch.allclose(span.weights(span.map(weights)), weights, atol=1e-4)
+    span = BasisMaps(maps)
+    assert torch.allclose(span.fit_weights(span.compose(weights)), weights, atol=1e-4)
 
 
 @pytest.mark.medium
@@ -123,7 +123,7 @@ def test_harmonics_are_predicted_while_the_map_is_above_zero() -> None:
     brighter = made.start.clone()
     brighter[:3] += 0.1  # the same light from everywhere
     found, noise = off(made, basis, brighter)
-    assert basis.lights == 10 and found < 1.6 * noise
+    assert basis.n_traced_images == 10 and found < 1.6 * noise
     assert levels(basis(brighter), basis(made.start)) > 3.0 * noise
 
 
@@ -140,7 +140,7 @@ def test_texture_and_light_are_predicted_together() -> None:
     with torch.no_grad():
         traced = made(changed, seed=5, spp=256) - made(lit, seed=5, spp=256)
         assert levels(basis(changed) - basis(lit), traced) < 0.35 * levels(traced, torch.zeros_like(traced))
-    assert basis.lights == 2 and basis.entries > 0
+    assert basis.n_traced_images == 2 and basis.n_entries > 0
 
 
 @pytest.mark.parametrize(
@@ -154,16 +154,16 @@ def test_texture_and_light_are_predicted_together() -> None:
     ],
 )
 def test_where_light_can_be_predicted(controls: Any, options: dict[str, Any], reason: str | None) -> None:
-    refusal = lights.why_not(rendered_by(controls, **options))
+    refusal = lights.find_refusal(rendered_by(controls, **options))
     assert (None if refusal is None else refusal.text) == reason
 
 
 def test_a_light_of_a_mitsuba_scene_is_in_no_basis_picture() -> None:
     """It would be in the picture of each light, as often as the power of that one says."""
-    loaded = advsearch.load_scene("large-box", scene=mitsuba().cornell_box())
+    loaded = advsearch.load_scene("large-box", scene=import_mitsuba().cornell_box())
     made = loaded.renderer({"light:spot": {"power": [0, 12]}}, resolution=8)
-    assert str(lights.why_not(made)) == "spot.power changes light, and the scene has other lights of its own"
-    assert not lighting(made).moved
+    assert str(lights.find_refusal(made)) == "spot.power changes light, and the scene has other lights of its own"
+    assert not find_lighting(made).changed_inputs
 
 
 # ---- searches -------------------------------------------------------------------------------------------------------
@@ -180,7 +180,7 @@ SEARCH: dict[str, Any] = {
 
 @pytest.mark.medium
 def test_a_search_over_light_renders_its_basis_and_its_comparisons(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(searching, "EVERY", 8)
+    monkeypatch.setattr(searching, "COMPARISON_INTERVAL", 8)
     for name in ("BOUND", "MARGIN"):
         monkeypatch.setattr(acceptance, name, 50.0)
     found = advsearch.attack("mug", run=None, **SEARCH).summary
@@ -196,9 +196,9 @@ def test_a_prediction_that_is_off_ends_in_rendering_and_goes_on_so(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Also in a run that was stopped after that."""
-    monkeypatch.setattr(searching, "EVERY", 6)
-    off = acceptance.Deviation(9.0, 0.0, 2.0, pictures=6)
-    monkeypatch.setattr(searching, "compared", lambda view: off)
+    monkeypatch.setattr(searching, "COMPARISON_INTERVAL", 6)
+    off = acceptance.Deviation(9.0, 0.0, 2.0, n_traced=6)
+    monkeypatch.setattr(searching, "compare_views", lambda view: off)
     settings = {**SEARCH, "deterministic": True}
     whole = advsearch.attack("mug", run=tmp_path / "whole", **settings).summary
     assert whole.transport is not None and "from evaluation 6" in str(whole.transport.reason)
@@ -220,7 +220,7 @@ def test_a_prediction_that_is_off_ends_in_rendering_and_goes_on_so(
 def test_a_search_over_light_that_renders_says_why(
     options: dict[str, Any], reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(searching, "WORTH_A_LIGHT", 10)
+    monkeypatch.setattr(searching, "MIN_STEPS_PER_LIGHT", 10)
     found = advsearch.attack("mug", run=None, **{**SEARCH, "steps": 16, **options}).summary
     assert found.transport is not None and found.transport.reason == reason
     assert found.renders["products"] == 0

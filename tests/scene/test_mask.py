@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls import Space
-from advsearch.engine.loading import as_controls, load_scene
+from advsearch.engine.loading import load_scene, make_controls
 from advsearch.errors import InputError
 from advsearch.scene.renderer import Renderer
 
@@ -59,7 +59,7 @@ def cast(render: Renderer, u: Tensor) -> dict[str, Doubles]:
 
 @pytest.fixture(scope="module")
 def moved() -> Renderer:
-    return load_scene("banana").renderer(as_controls(VARIED), resolution=SIZE, denoise="none")
+    return load_scene("banana").renderer(make_controls(VARIED), resolution=SIZE, denoise="none")
 
 
 @pytest.mark.medium
@@ -86,7 +86,7 @@ def test_a_mask_is_of_its_own_configuration_and_leaves_renders_as_they_are(moved
 
 
 def mask_of(controls: dict[str, dict[str, object]]) -> Tensor:
-    render = load_scene("mug").renderer(as_controls(controls), resolution=SIZE, denoise="none")
+    render = load_scene("mug").renderer(make_controls(controls), resolution=SIZE, denoise="none")
     return render.mask(render.start)
 
 

@@ -14,9 +14,9 @@ import torch
 
 import advsearch
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
-from advsearch.scene.mitsuba_backend.scene_files import contents, import_plugins
-from advsearch.scene.mitsuba_backend.shapes import haze_in
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene, read_contents
+from advsearch.scene.mitsuba_backend.shapes import find_haze
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.xml_files import read_scene
 from advsearch.scene.parts import PluginPart
 
@@ -64,15 +64,15 @@ def test_a_file_is_read_as_it_says(box: Path) -> None:
 
 
 def test_contents_are_named(box: Path) -> None:
-    found = contents(box)
+    found = read_contents(box)
     assert found.objects == ("light", "floor", "largebox", "ball")
-    assert dict(found.kept) == {"white": "diffuse"}
+    assert dict(found.unchanged) == {"white": "diffuse"}
     assert found.lights == ("light",)
     assert found.cameras == ("front",)
 
 
 def test_the_object_stands_and_the_rest_is_kept(box: Path) -> None:
-    found = import_plugins(box, "largebox")
+    found = import_mitsuba_scene(box, "largebox")
     vertices = found.object.mesh.vertices
     assert np.ptp(vertices, axis=0).max() == pytest.approx(1.0)
     assert vertices[:, 2].min() == pytest.approx(0.0, abs=1e-6)
@@ -86,26 +86,26 @@ def test_the_object_stands_and_the_rest_is_kept(box: Path) -> None:
 
 @pytest.mark.parametrize("typed", ["large-box", "LargeBox", "large_box"])
 def test_an_id_is_found_whatever_its_case_and_signs(box: Path, typed: str) -> None:
-    found = import_plugins(box, typed)
+    found = import_mitsuba_scene(box, typed)
     assert [part.name for part in found.surroundings] == ["white", "light", "floor", "ball"]
 
 
 def test_a_name_that_several_ids_are_like_is_refused(box: Path, tmp_path: Path) -> None:
     other = tmp_path / "two.xml"
     other.write_text(box.read_text("utf-8").replace('id="ball"', 'id="large-box"'), encoding="utf-8")
-    assert "large-box" not in [part.name for part in import_plugins(other, "large-box").surroundings]
+    assert "large-box" not in [part.name for part in import_mitsuba_scene(other, "large-box").surroundings]
     with pytest.raises(UnknownNameError, match="large-box"):
-        import_plugins(other, "large_box")
+        import_mitsuba_scene(other, "large_box")
 
 
 def test_a_wrong_id_lists_those_there(box: Path) -> None:
     with pytest.raises(UnknownNameError, match="largebox"):
-        import_plugins(box, "largebix")
+        import_mitsuba_scene(box, "largebix")
 
 
 def _stock(path: Path) -> np.ndarray:
     """The file's picture by Mitsuba alone, without the first row and column of pixels."""
-    mi = mitsuba()
+    mi = import_mitsuba()
     scene = mi.load_file(str(path))
     return np.array(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 6}), spp=512))
 
@@ -127,7 +127,7 @@ def test_the_picture_is_mitsubas_own(box: Path, shape: str) -> None:
 @pytest.mark.medium
 def test_cornell_box_is_attacked_by_id() -> None:
     found = advsearch.attack(
-        mitsuba().cornell_box(),
+        import_mitsuba().cornell_box(),
         object="large-box",
         label="wine glass",
         controls={"pose": {"yaw": [0, 90]}, "texture": {"resolution": 4}},
@@ -144,7 +144,7 @@ def test_cornell_box_is_attacked_by_id() -> None:
 
 def test_a_dictionary_needs_an_object() -> None:
     with pytest.raises(InputError, match="which shape"):
-        advsearch.attack(mitsuba().cornell_box())
+        advsearch.attack(import_mitsuba().cornell_box())
 
 
 LAUGHS = "".join(f'<default name="v{n}" value="{f"$v{n - 1}" * 10}"/>' for n in range(1, 12))
@@ -184,7 +184,7 @@ def test_a_hostile_file_is_refused(tmp_path: Path, text: str, reason: str) -> No
     path = folder / "box.xml"
     path.write_text(text)
     with pytest.raises(FileFormatError, match=reason):
-        contents(path)
+        read_contents(path)
 
 
 WRONG = {
@@ -209,7 +209,7 @@ def test_a_text_or_nothing_in_the_place_of_a_number_is_told(tmp_path: Path, insi
     path = tmp_path / "a.xml"
     path.write_text(f'<scene version="3.0.0">{inside}<emitter type="constant"/></scene>')
     with pytest.raises(InputError, match=message):
-        import_plugins(path, "it")
+        import_mitsuba_scene(path, "it")
 
 
 def test_an_id_of_thousands_of_letters_is_found(tmp_path: Path) -> None:
@@ -252,7 +252,7 @@ def test_an_entry_that_the_object_does_not_have_is_named(tmp_path: Path) -> None
     path.write_text(
         '<scene version="3.0.0"><shape type="cube" id="thing"><float name="roundness" value="1"/></shape></scene>'
     )
-    assert "'roundness' is left out: a cube has none" in " ".join(import_plugins(path, "thing").object.warnings)
+    assert "'roundness' is left out: a cube has none" in " ".join(import_mitsuba_scene(path, "thing").object.warnings)
 
 
 @pytest.mark.parametrize(
@@ -281,7 +281,7 @@ def test_haze_is_one_grey_medium_in_a_ball_around_the_camera(changed: dict[str, 
     }
     for name, values in changed.items():
         named[name] = {**named.get(name, {}), **values}
-    found = haze_in(named, np.diag([0.5, 0.5, 0.5, 1.0]))
+    found = find_haze(named, np.diag([0.5, 0.5, 0.5, 1.0]))
     assert (found is not None) == is_haze
     if found is not None:
         haze, used = found
@@ -296,7 +296,9 @@ def test_a_medium_is_scaled_with_the_object_wherever_it_stands(inside: bool) -> 
     cloud = {"type": "sphere", "center": [0, 0, 9], "bsdf": {"type": "null"}, "interior": held}
     scene = {"type": "scene", "box": {"type": "cube"}, "cloud": cloud, **({} if inside else {"smoke": smoke})}
     parts = {
-        part.name: part.plugin for part in import_plugins(scene, "box").surroundings if isinstance(part, PluginPart)
+        part.name: part.plugin
+        for part in import_mitsuba_scene(scene, "box").surroundings
+        if isinstance(part, PluginPart)
     }
     medium: Any = parts["cloud"]["interior"] if inside else parts["smoke"]
     assert medium["scale"] == 2.0  # the cube is 2 wide

@@ -16,10 +16,10 @@ import advsearch
 from advsearch.engine.loading import Scene
 from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.mitsuba_backend.meshes import base_texture, repeating
+from advsearch.scene.mitsuba_backend.meshes import make_base_texture, to_repeating_uv
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.scene_files import import_plugins
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene
 from covering import once_each
 
@@ -220,7 +220,7 @@ def written(folder: Path, name: str, shapes: str) -> Path:
 
 def stock(path: Path) -> np.ndarray:
     """The file's picture by Mitsuba alone, as it is displayed."""
-    mi = mitsuba()
+    mi = import_mitsuba()
     found = np.array(
         mi.render(mi.load_file(str(path)), integrator=mi.load_dict({"type": "path", "max_depth": 6}), spp=SAMPLES)
     )
@@ -261,21 +261,21 @@ def test_it_still_does_when_it_is_written_again(folder: Path, tmp_path: Path) ->
 @once_each("wrap, filter", ["repeat", "mirror", "clamp"], ["bilinear", "nearest"])
 def test_where_a_repeating_texture_shows_the_same(filter: str, wrap: str) -> None:
     """What predicts pictures looks textures up as if they repeated and were interpolated."""
-    mi = mitsuba()
+    mi = import_mitsuba()
     chance = np.random.default_rng(0)
     color, uv = chance.random((4, 6, 3), dtype=np.float32), chance.random((100, 2), dtype=np.float32) * 4.0 - 2.0
     turn = np.array([[0.8, -0.6, 0.0, 0.1], [0.6, 0.8, 0.0, 0.2], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     options = {"filter_type": filter, "wrap_mode": wrap, "to_uv": turn}
     at = mi.SurfaceInteraction3f()
     at.uv = mi.Point2f(mi.Float(uv[:, 0]), mi.Float(uv[:, 1]))
-    theirs = np.array(mi.load_dict(base_texture(color, options)).eval(at)).reshape(3, -1).T
-    found = repeating(torch.from_numpy(uv), options, (4, 6)).numpy().astype(np.float64)
-    linear = np.array(mi.load_dict(base_texture(color, {})).eval(_at(found))).reshape(3, -1).T
+    theirs = np.array(mi.load_dict(make_base_texture(color, options)).eval(at)).reshape(3, -1).T
+    found = to_repeating_uv(torch.from_numpy(uv), options, (4, 6)).numpy().astype(np.float64)
+    linear = np.array(mi.load_dict(make_base_texture(color, {})).eval(_at(found))).reshape(3, -1).T
     np.testing.assert_allclose(linear, theirs, atol=2e-4)
 
 
 def _at(uv: np.ndarray) -> object:
-    mi = mitsuba()
+    mi = import_mitsuba()
     found = mi.SurfaceInteraction3f()
     found.uv = mi.Point2f(mi.Float(uv[:, 0].astype(np.float32)), mi.Float(uv[:, 1].astype(np.float32)))
     return found
@@ -290,7 +290,7 @@ def test_what_is_not_there_is_named(folder: Path) -> None:
         + shape
         + "</scene>"
     )
-    told = " ".join(import_plugins(path, "thing").object.warnings)
+    told = " ".join(import_mitsuba_scene(path, "thing").object.warnings)
     for part in ("no attribute 'vertex_colour' (it has none)", "not for texture, patch", "crop", "max_depth of 2"):
         assert part in told
 
@@ -308,8 +308,8 @@ def test_controls_that_cannot_be_are_refused(folder: Path) -> None:
 
 def test_a_mask_of_mitsubas_own_is_a_cut_out(folder: Path) -> None:
     scene = advsearch.load_scene(f"{written(folder, 'leaf', SHAPES['mask and a colour'])}#thing")
-    assert scene.description.cut_out
-    assert not advsearch.load_scene(f"{written(folder, 'red', SHAPES['flat'])}#thing").description.cut_out
+    assert scene.description.has_opacity
+    assert not advsearch.load_scene(f"{written(folder, 'red', SHAPES['flat'])}#thing").description.has_opacity
 
 
 @pytest.mark.parametrize("controls", ["environment.rotation", "sky", {"environment": {"which": "noon"}}])
@@ -328,4 +328,4 @@ def test_a_surface_that_grows_by_its_references_is_refused(folder: Path) -> None
     )
     path = written(folder, "bomb", levels + '<bsdf type="diffuse" id="b30"/>' + mesh("slab.obj", '<ref id="b0"/>'))
     with pytest.raises(InputError, match="at most 2000 plugins"):
-        import_plugins(path, "thing")
+        import_mitsuba_scene(path, "thing")

@@ -13,7 +13,7 @@ import pytest
 
 import advsearch
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_xml
 from advsearch.scene.mitsuba_backend.xml_files import read_scene
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("two_threads")
 
 
 def test_a_dictionary_written_and_read_is_the_same(tmp_path: Path) -> None:
-    mi = mitsuba()
+    mi = import_mitsuba()
     matrix = np.array([[0.1, 0, 0, 1 / 3], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     scene = {
         "type": "scene",
@@ -93,7 +93,7 @@ SIDE = {"cube": [2, 3, 4], "sphere": [3, -3, 3], "cylinder": [4, 3, 2]}
     ],
 )  # fmt: skip
 def test_a_picture_on_a_shape_is_where_mitsuba_has_it(tmp_path: Path, kind: str) -> None:
-    mi = mitsuba()
+    mi = import_mitsuba()
     (tmp_path / "square.obj").write_text(SQUARE)
     mi.load_dict({"type": "obj", "filename": str(tmp_path / "square.obj")}).write_ply(str(tmp_path / "square.ply"))
     colors = np.linspace(0.1, 0.9, 16 * 8 * 3, dtype=np.float32).reshape(16, 8, 3)
@@ -123,5 +123,5 @@ def test_a_picture_on_a_shape_is_where_mitsuba_has_it(tmp_path: Path, kind: str)
     write_xml(tmp_path / "square.xml", scene, {}, "")
     theirs = np.array(mi.render(mi.load_file(str(tmp_path / "square.xml")), spp=64))
     description = advsearch.load_scene(f"{tmp_path}/square.xml#square").description
-    ours = MitsubaScene(description, (16, 16), max_depth=2).radiance({}, 0, 64).numpy()
+    ours = MitsubaScene(description, (16, 16), max_depth=2).render_radiance({}, 0, 64).numpy()
     assert np.abs(ours - theirs).mean() < 0.02

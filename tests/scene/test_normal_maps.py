@@ -19,14 +19,14 @@ from trimesh.visual.material import PBRMaterial
 
 import advsearch
 from advsearch.errors import FileFormatError
-from advsearch.scene.assembly import posed
-from advsearch.scene.assets import Floats, ObjectAsset
-from advsearch.scene.description import OBJECT, SceneDescription, describe
-from advsearch.scene.glb import glb
+from advsearch.scene.assembly import pose_mesh
+from advsearch.scene.assets import Float32Array, ObjectAsset
+from advsearch.scene.description import OBJECT, SceneDescription, load_description
+from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.importing.parts import FLAT, holds_normals, normal_map
+from advsearch.scene.importing.parts import FLAT_TEXEL, has_normals, make_normal_map
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene
 from advsearch.scene.parts import PointLamp
 
@@ -80,7 +80,7 @@ def halves(mirrored: bool, grey: float) -> trimesh.Scene:
 
 def corner() -> trimesh.Trimesh:
     """The square with the normal map in a corner of its picture."""
-    canvas = np.full((1024, 1024, 3), np.uint8(np.round(FLAT * 255)))
+    canvas = np.full((1024, 1024, 3), np.uint8(np.round(FLAT_TEXEL * 255)))
     canvas[-SIDE:, :SIDE] = bump()
     return card(UNIT / 8.0, canvas)
 
@@ -128,7 +128,7 @@ def real() -> trimesh.Trimesh:
 
 def sides(scene: SceneDescription, x: float, z: float) -> tuple[float, float]:
     """How much brighter than the square the bump is on its right over its left, and on its top over its bottom."""
-    picture = lit(scene, x, z).radiance({}, 0, 64).mean(dim=2)
+    picture = lit(scene, x, z).render_radiance({}, 0, 64).mean(dim=2)
     plain = picture[picture > 0.0].median()
     row, column = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
     middle = (SIZE - 1) / 2.0
@@ -144,7 +144,7 @@ LAMPS = [(4.0, 0.0), (0.0, -4.0)]
 @pytest.fixture(scope="module")
 def wanted(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[float, float]]:
     """The same of the real bump."""
-    scene = describe(str(written(real(), tmp_path_factory.mktemp("real"))), "none", given=SEEN)
+    scene = load_description(str(written(real(), tmp_path_factory.mktemp("real"))), "none", given=SEEN)
     return [sides(scene, x, z) for x, z in LAMPS]
 
 
@@ -153,7 +153,7 @@ def wanted(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[float, float]
 def test_a_bump_is_lit_as_its_geometry_from_two_sides(
     way: str, wanted: list[tuple[float, float]], tmp_path: Path
 ) -> None:
-    scene = describe(str(written(WAYS[way](), tmp_path)), "none", given=SEEN)
+    scene = load_description(str(written(WAYS[way](), tmp_path)), "none", given=SEEN)
     assert scene.object.normal_map is not None
     found = [sides(scene, x, z) for x, z in LAMPS]
     assert wanted[0][0] > 0.2 and wanted[1][1] < -0.2
@@ -171,13 +171,13 @@ def with_material(data: bytes, **entries: Any) -> bytes:
     return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
 
 
-def vectors(texels: Floats | None) -> np.ndarray:
+def vectors(texels: Float32Array | None) -> np.ndarray:
     assert texels is not None
     return texels.astype(np.float64) * 2.0 - 1.0
 
 
 def of_the_bump(scale: float = 1.0) -> np.ndarray:
-    return vectors(normal_map(bump() / np.float32(255.0), scale))
+    return vectors(make_normal_map(bump() / np.float32(255.0), scale))
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0, -1.0, 1e30, 0.0])
@@ -244,9 +244,9 @@ def test_heights_and_what_is_missing_are_left_out_and_said(tmp_path: Path) -> No
 
 def test_grey_pictures_and_colours_are_no_normals() -> None:
     random = np.random.default_rng(0)
-    assert holds_normals(bump() / np.float32(255.0))
-    assert not holds_normals(np.full((8, 8, 3), 0.79, np.float32))
-    assert not holds_normals(random.random((32, 32, 3), np.float32))
+    assert has_normals(bump() / np.float32(255.0))
+    assert not has_normals(np.full((8, 8, 3), 0.79, np.float32))
+    assert not has_normals(random.random((32, 32, 3), np.float32))
 
 
 def test_a_large_normal_map_is_averaged_as_numbers(tmp_path: Path) -> None:
@@ -259,8 +259,8 @@ def test_a_large_normal_map_is_averaged_as_numbers(tmp_path: Path) -> None:
 
 
 def test_gltf_out_has_the_same_normals(tmp_path: Path) -> None:
-    part = describe(str(written(halves(True, 0.7), tmp_path))).meshes[OBJECT]
-    (tmp_path / "out.glb").write_bytes(glb([posed(part, {})]))
+    part = load_description(str(written(halves(True, 0.7), tmp_path))).meshes[OBJECT]
+    (tmp_path / "out.glb").write_bytes(encode_glb([pose_mesh(part, {})]))
     again = import_object(tmp_path / "out.glb")
     assert part.normal_map is not None and again.warnings == ()
     np.testing.assert_allclose(vectors(again.normal_map), vectors(part.normal_map), atol=0.012)
@@ -273,12 +273,12 @@ def test_stock_mitsuba_renders_the_normals_that_are_written(tmp_path: Path) -> N
     renderer = advsearch.load_scene(file, settings=SEEN).renderer("pose", resolution=SIZE, denoise="none")
     (tmp_path / "out").mkdir()
     write_scene(renderer.scene, {}, tmp_path / "out" / "scene.xml", "")
-    mi = mitsuba()
+    mi = import_mitsuba()
     theirs = torch.from_numpy(np.array(mi.render(mi.load_file(str(tmp_path / "out" / "scene.xml")), spp=256)))[..., :3]
-    ours = renderer.scene.radiance({}, 0, 256)
-    flat = describe(str(file), given=SEEN)
+    ours = renderer.scene.render_radiance({}, 0, 256)
+    flat = load_description(str(file), given=SEEN)
     flat = replace(flat, object=replace(flat.object, normal_map=None))
-    without = MitsubaScene(flat, (SIZE, SIZE)).radiance({}, 0, 256)
+    without = MitsubaScene(flat, (SIZE, SIZE)).render_radiance({}, 0, 256)
     assert (theirs - ours).abs().mean() < 0.03 * ours.mean() < (without - ours).abs().mean() * 3.0
 
 
@@ -288,10 +288,10 @@ def test_surroundings_have_their_normal_maps(tmp_path: Path) -> None:
     scene.add_geometry(card(vertices=CORNERS * 4.0), node_name="wall")
     file = tmp_path / "room.glb"
     file.write_bytes(scene.export(file_type="glb"))
-    described = describe(f"{file}#box")
+    described = load_description(f"{file}#box")
     wall = described.meshes["wall"]
     (default,) = described.notes
-    assert "without material" in default and described.object.normal_map is None and described.normal_mapped
+    assert "without material" in default and described.object.normal_map is None and described.has_normal_maps
     np.testing.assert_allclose(vectors(wall.normal_map), of_the_bump(), atol=1e-6)
 
 

@@ -10,11 +10,11 @@ import pytest
 
 from advsearch.errors import FileFormatError
 from advsearch.files import MESHES
-from advsearch.scene.importing.files import BLENDER_READS, SAID, advice
+from advsearch.scene.importing.files import BLENDER_IMPORTERS, FORMAT_ADVICE, find_advice
 from advsearch.scene.importing.objects import import_object
 
-ENDINGS = [one for _, endings in BLENDER_READS.values() for one in endings]
-ENDINGS += [one for _, endings in SAID.values() for one in endings]
+ENDINGS = [one for _, endings in BLENDER_IMPORTERS.values() for one in endings]
+ENDINGS += [one for _, endings in FORMAT_ADVICE.values() for one in endings]
 ENDINGS += [".bin"]
 
 
@@ -43,13 +43,13 @@ def test_it_says_what_the_file_is_and_then_what_to_do(ending: str, what: str, do
 
 def test_no_ending_is_there_twice_or_is_read() -> None:
     assert len(set(ENDINGS)) == len(ENDINGS) and not set(ENDINGS) & set(MESHES)
-    assert all(advice(Path(f"a{one}")) for one in ENDINGS)
-    assert advice(Path("a.nonsense")) is None
+    assert all(find_advice(Path(f"a{one}")) for one in ENDINGS)
+    assert find_advice(Path("a.nonsense")) is None
 
 
 @pytest.mark.parametrize("name", ["plain.fbx", 'it\'s "mine" $(x).fbx'])
 def test_blender_is_given_one_argument_of_python(name: str) -> None:
-    command = (advice(Path(name)) or "").rpartition("with Blender: ")[2]
+    command = (find_advice(Path(name)) or "").rpartition("with Blender: ")[2]
     *start, script = shlex.split(command)
     assert start == ["blender", "-b", "--python-expr"]
     calls = [node for node in ast.walk(ast.parse(script)) if isinstance(node, ast.Call)]

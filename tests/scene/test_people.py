@@ -9,10 +9,10 @@ from torch import Tensor
 
 from advsearch.controls import make_control, make_space
 from advsearch.errors import InputError
-from advsearch.scene.description import describe
-from advsearch.scene.people import GAIT, PARAMETERS, Person, body_data, walked
+from advsearch.scene.description import load_description
+from advsearch.scene.people import GAIT, PARAMETERS, Person, add_walk, load_body
 
-PERSON = Person(body_data())
+PERSON = Person(load_body())
 
 
 def numbers(**given: float) -> dict[str, Tensor]:
@@ -27,23 +27,23 @@ def of_tag(vertices: Tensor, *tags: str) -> np.ndarray:
 @pytest.mark.parametrize("height", [1.2, 1.5, 1.7, 2.0])
 @pytest.mark.parametrize("more", [{}, {"gender": 0.0, "age": 70.0}, {"age": 12.0, "weight": 0.9}])
 def test_someone_is_as_tall_as_asked_for(height: float, more: dict[str, float]) -> None:
-    vertices = PERSON.posed(numbers(height=height, **more))
+    vertices = PERSON.pose(numbers(height=height, **more))
     tall = float(vertices[:, 2].max())  # with soles of 14 mm and hair of 14 mm, which grow along
     assert tall == pytest.approx(height, abs=0.05)
     assert float(vertices[:, 2].min()) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_the_bundled_mesh_is_the_person_that_stands() -> None:
-    mesh = describe("person").object.mesh
-    assert mesh.rig is not None and describe("person").object.metres == pytest.approx(PERSON.size, abs=1e-4)
-    size = np.ptp(PERSON.standing.numpy(), axis=0) / PERSON.size
+    mesh = load_description("person").object.mesh
+    assert mesh.rig is not None and load_description("person").object.metres == pytest.approx(PERSON.size, abs=1e-4)
+    size = np.ptp(PERSON.standing_points.numpy(), axis=0) / PERSON.size
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), size, atol=2e-6)
     assert torch.equal(mesh.rig.offsets({}), torch.zeros(len(mesh.vertices), 3))
 
 
 @pytest.mark.parametrize("walk", range(0, 360, 30))
 def test_a_walker_stays_on_the_ground_and_upright(walk: int) -> None:
-    vertices = PERSON.posed(numbers(walk=walk, stride=1.0))
+    vertices = PERSON.pose(numbers(walk=walk, stride=1.0))
     assert float(vertices[:, 2].min()) == pytest.approx(0.0, abs=1e-6)
     assert 1.55 < float(vertices[:, 2].max()) < 1.78
     shoes = of_tag(vertices, "shoes")
@@ -61,7 +61,7 @@ def test_each_foot_in_stance_is_on_the_ground(more: dict[str, float], stride: fl
     """From the strike of its heel until its toes leave the ground, at 60 % of its cycle; the other goes through no
     ground, and swings free in the middle of an ordinary step."""
     for walk in range(0, 360, 18):
-        vertices = PERSON.posed(numbers(walk=walk, stride=stride, **more))
+        vertices = PERSON.pose(numbers(walk=walk, stride=stride, **more))
         for begin, ahead in ((0.0, vertices[:, 1] > 0), (180.0, vertices[:, 1] < 0)):
             of_shoe = np.repeat(PERSON.data["tags"], PERSON.data["points"]) == "shoes"
             height = float(vertices[torch.from_numpy(of_shoe) & ahead, 2].min())
@@ -76,23 +76,23 @@ def test_legs_of_a_walker_stay_as_long_as_they_are() -> None:
     for stride, most in ((0.0, 0.0), (0.6, 0.04), (1.0, 0.04), (1.3, 0.1)):
         raised = list[float]()
         for walk in range(0, 216, 18):
-            values = PERSON._numbers(numbers(walk=walk, stride=stride))
+            values = PERSON._complete_values(numbers(walk=walk, stride=stride))
             points = PERSON._tensors["mean"] + torch.einsum(
                 "r,rpc->pc",
-                torch.einsum("gawh,gawhr->r", PERSON._phenotype(values)[0], PERSON._tensors["shares"]),
+                torch.einsum("gawh,gawhr->r", PERSON._mix_phenotype(values)[0], PERSON._tensors["shares"]),
                 PERSON._tensors["basis"],
             )
             bones = len(PERSON._bones)
-            rise = PERSON._leg_corrections(points[:-bones], points[-bones:], values)
+            rise = PERSON._compute_leg_corrections(points[:-bones], points[-bones:], values)
             raised.append(abs(float(rise["l"])))
         assert max(raised) <= most, (stride, max(raised))
 
 
 def test_a_turn_of_the_walk_is_the_same_with_the_sides_exchanged() -> None:
-    left, right = (walked(PERSON._numbers(numbers(walk=walk, stride=1.0))) for walk in (40.0, 220.0))
+    left, right = (add_walk(PERSON._complete_values(numbers(walk=walk, stride=1.0))) for walk in (40.0, 220.0))
     for joint in GAIT:
         torch.testing.assert_close(left[f"left_{joint}"], right[f"right_{joint}"])
-    heel = walked(PERSON._numbers(numbers(walk=0.0, stride=1.0)))
+    heel = add_walk(PERSON._complete_values(numbers(walk=0.0, stride=1.0)))
     assert float(heel["left_hip"]) > 20 > -5 > float(heel["right_hip"]), "the leg whose heel strikes is ahead"
     assert float(heel["left_shoulder"]) < 0 < float(heel["right_shoulder"]), "arms swing against the legs"
 
@@ -114,7 +114,7 @@ def test_a_turn_of_the_walk_is_the_same_with_the_sides_exchanged() -> None:
 def test_a_joint_moves_what_its_name_says_where_it_says(
     angle: dict[str, float], tag: str, axis: int, sign: int
 ) -> None:
-    before, after = of_tag(PERSON.standing, tag), of_tag(PERSON.posed(numbers(**angle)), tag)
+    before, after = of_tag(PERSON.standing_points, tag), of_tag(PERSON.pose(numbers(**angle)), tag)
     moved = sign * (after - before)[:, axis]
     assert moved.max() > 0.03 and moved.max() > -1.5 * moved.min()
 
@@ -124,7 +124,7 @@ def test_a_rigid_part_keeps_its_shape_and_turns_by_the_angle() -> None:
     weights = PERSON.data["weights"][PERSON.data["index"]]
     head = (whose == "hair") & (weights[:, list(PERSON.data["bones"]).index("head")] == weights.sum(axis=1))
     assert head.sum() > 100
-    before, after = PERSON.standing.numpy()[head], PERSON.posed(numbers(neck=20, neck_turn=40)).numpy()[head]
+    before, after = PERSON.standing_points.numpy()[head], PERSON.pose(numbers(neck=20, neck_turn=40)).numpy()[head]
     a, b = before - before.mean(axis=0), after - after.mean(axis=0)
     u, _, v = np.linalg.svd(a.T @ b)
     turn = (u @ v).T
@@ -136,7 +136,7 @@ def test_a_rigid_part_keeps_its_shape_and_turns_by_the_angle() -> None:
 
 
 def test_gradients_of_every_number_are_those_of_differences() -> None:
-    person = Person(body_data())
+    person = Person(load_body())
     for name, held in person._tensors.items():
         person._tensors[name] = held.double() if held.is_floating_point() else held
     middle = {
@@ -144,37 +144,39 @@ def test_gradients_of_every_number_are_those_of_differences() -> None:
         for one in PARAMETERS
     }
     values = {name: value.double().requires_grad_() for name, value in middle.items()}
-    weight = torch.randn(len(person.standing), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    found = torch.autograd.grad((weight * person.posed(values)).sum(), list(values.values()))
+    weight = torch.randn(
+        len(person.standing_points), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    found = torch.autograd.grad((weight * person.pose(values)).sum(), list(values.values()))
     for (name, value), slope in zip(values.items(), found, strict=True):
         step = 1e-4
         up, down = ({**values, name: value.detach() + sign * step} for sign in (1, -1))
         with torch.no_grad():
-            rise = float((weight * (person.posed(up) - person.posed(down))).sum()) / (2 * step)
+            rise = float((weight * (person.pose(up) - person.pose(down))).sum()) / (2 * step)
         assert float(slope) == pytest.approx(rise, rel=1e-3, abs=1e-3), name
 
 
 def test_the_derivative_at_an_average_weight_is_that_of_one_side() -> None:
     def waist(weight: float, step: float = 0.0) -> float:
-        return float(PERSON.posed(numbers(weight=weight + step))[:718].square().sum())
+        return float(PERSON.pose(numbers(weight=weight + step))[:718].square().sum())
 
     weight = torch.tensor(0.5, requires_grad=True)
-    (slope,) = torch.autograd.grad(PERSON.posed({"weight": weight})[:718].square().sum(), weight)
+    (slope,) = torch.autograd.grad(PERSON.pose({"weight": weight})[:718].square().sum(), weight)
     assert float(slope) == pytest.approx((waist(0.5, 0.02) - waist(0.5)) / 0.02, rel=0.1)
 
 
 def test_the_control_refuses_what_has_no_joints_and_angles_past_their_limits() -> None:
     with pytest.raises(InputError, match="object has no joints; take `object=person`"):
-        make_space([make_control("body")], describe("mug"))
+        make_space([make_control("body")], load_description("mug"))
     with pytest.raises(InputError, match=r"body\.left_elbow"):
         make_control("body", {"left_elbow": [0, 170]})
-    space = make_space([make_control("body", {"left_elbow": [0, 140]})], describe("person"))
+    space = make_space([make_control("body", {"left_elbow": [0, 140]})], load_description("person"))
     assert len(space.start) == 1 and 40 < float(space.describe(space.start)["body.mass"]["value"]) < 90
 
 
 def test_clothes_are_areas_that_can_be_painted_alone() -> None:
-    scene = describe("person")
+    scene = load_description("person")
     for area in ("shirt", "trousers", "skin", "hair", "shoes"):
         space = make_space([make_control(f"texture:{area}", {"epsilon": 0.5})], scene)
-        sheet = space.controls[0].printed(space.start)
+        sheet = space.controls[0].get_printable_colors(space.start)
         assert sheet is not None and sheet.shape[-1] == 4 and 0.005 < float(sheet[..., 3].mean()) < 0.5

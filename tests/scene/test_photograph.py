@@ -14,10 +14,10 @@ import advsearch
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.description import describe
-from advsearch.scene.grounds import Photograph, irradiance
+from advsearch.scene.description import load_description
+from advsearch.scene.grounds import Photograph, compute_irradiance
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.settings import resolve
+from advsearch.scene.settings import resolve_settings
 
 SIZE = 32
 AWAY = {"pose.x": 900.0, "pose.scale": 0.01}
@@ -52,34 +52,38 @@ def from_the_tripod(height: float) -> Tensor:
 
 def test_a_floor_as_bright_as_the_light_is_white() -> None:
     flat = torch.full((16, 32, 3), 2.0)
-    assert torch.allclose(irradiance(flat), torch.full((3,), 2.0 * math.pi), rtol=1e-3)
+    assert torch.allclose(compute_irradiance(flat), torch.full((3,), 2.0 * math.pi), rtol=1e-3)
     photograph = Photograph(flat.numpy(), 3.0, 0.0)
-    assert torch.allclose(photograph.base, torch.ones_like(photograph.base), rtol=1e-3)
-    finer = photograph.reflectance(torch.full((64, 128, 3), 5.0))
-    assert finer.shape == (photograph.base.shape[0], 128, 3)
+    assert torch.allclose(photograph.base_color, torch.ones_like(photograph.base_color), rtol=1e-3)
+    finer = photograph.compute_reflectance(torch.full((64, 128, 3), 5.0))
+    assert finer.shape == (photograph.base_color.shape[0], 128, 3)
     assert torch.allclose(finer, torch.ones_like(finer), rtol=1e-3)
-    assert not photograph.reflectance(torch.zeros(16, 32, 3)).any()
+    assert not photograph.compute_reflectance(torch.zeros(16, 32, 3)).any()
 
 
 @pytest.mark.parametrize("rotation", [0.0, 70.0])
 def test_from_where_it_was_taken_the_floor_is_the_photograph(rotation: float) -> None:
     given = {**AWAY, "environment.rotation": rotation}
-    scene = describe("ball", room(), size=1.0, given={**given, "ground.height": 2.0})
+    scene = load_description("ball", room(), size=1.0, given={**given, "ground.height": 2.0})
     with_floor, without = scene, replace(scene, values={**scene.values, "ground.size": 0.0})
     assert scene.photograph is not None and without.photograph is None
     camera = {"camera.to_world": from_the_tripod(2.0)}
-    floor, photograph = (MitsubaScene(one, (SIZE, SIZE)).radiance(camera, 0, 256) for one in (with_floor, without))
+    floor, photograph = (
+        MitsubaScene(one, (SIZE, SIZE)).render_radiance(camera, 0, 256) for one in (with_floor, without)
+    )
     assert float(((floor - photograph).abs() / photograph).mean()) < NOISE
     assert float((floor.mean() / photograph.mean() - 1.0).abs()) < 0.01
     assert float(photograph.std() / photograph.mean()) > 0.2, "there is nothing to tell apart"
 
 
 def test_the_object_keeps_light_from_the_floor() -> None:
-    scene = describe("ball", room(), size=1.0, given={"camera.elevation": 60.0, "camera.distance": 4.0})
+    scene = load_description("ball", room(), size=1.0, given={"camera.elevation": 60.0, "camera.distance": 4.0})
     away = replace(scene, values={**scene.values, **AWAY})
     mitsuba = MitsubaScene(scene, (SIZE, SIZE))
-    seen = mitsuba.surfaces({}).seen("object")
-    ratio = (mitsuba.radiance({}, 0, 64) / MitsubaScene(away, (SIZE, SIZE)).radiance({}, 0, 64)).mean(dim=2)
+    seen = mitsuba.find_surfaces({}).visible_mask("object")
+    ratio = (mitsuba.render_radiance({}, 0, 64) / MitsubaScene(away, (SIZE, SIZE)).render_radiance({}, 0, 64)).mean(
+        dim=2
+    )
     near, outline = (
         torch.nn.functional.max_pool2d(seen[None].float(), width, stride=1, padding=width // 2)[0] > 0.0
         for width in (7, 3)
@@ -120,28 +124,28 @@ def test_derivatives_reach_the_floor(controls: dict[str, dict[str, object]]) -> 
 
 
 def test_photographed_environments_show_their_floor_unless_a_table_is_asked_for() -> None:
-    assert describe("mug").photograph is None
-    assert describe("mug", given={"ground.kind": "photograph"}).photograph is not None
-    assert describe("mug", room()).photograph is not None
+    assert load_description("mug").photograph is None
+    assert load_description("mug", given={"ground.kind": "photograph"}).photograph is not None
+    assert load_description("mug", room()).photograph is not None
     for given in ({"ground.kind": "table"}, {"ground.size": 2.0}, {"ground.red": 0.2}, {"ground.size": 0.0}):
-        assert describe("mug", room(), given=given).photograph is None, given
-    assert replace(describe("mug", room()), backdrop=True).photograph is None
+        assert load_description("mug", room(), given=given).photograph is None, given
+    assert replace(load_description("mug", room()), backdrop=True).photograph is None
     assert load_scene("mug", room()).with_settings({"ground.kind": "table"}).description.photograph is None
 
 
 def test_the_kind_of_ground_is_told_by_its_name() -> None:
     scene = load_scene("mug", room(), settings={"ground.kind": "table", "camera.azimuth": 7.0})
     assert repr(scene) == "Scene('mug', 'room', camera.azimuth=7.0, ground.kind='table')"
-    assert resolve(scene.description.given_values) == scene.description.values
+    assert resolve_settings(scene.description.requested_values) == scene.description.values
 
 
 def test_what_contradicts_it_is_explained() -> None:
     with pytest.raises(InputError, match=r"ground\.kind=photograph: the scene has no environment map to show"):
-        describe("mug", "none", given={"ground.kind": "photograph"})
+        load_description("mug", "none", given={"ground.kind": "photograph"})
     with pytest.raises(InputError, match=r"ground\.kind=photograph and `set` ground\.red contradict each other"):
-        describe("mug", room(), given={"ground.kind": "photograph", "ground.red": 0.5})
+        load_description("mug", room(), given={"ground.kind": "photograph", "ground.red": 0.5})
     with pytest.raises(UnknownNameError, match=r"unknown ground.kind 'tabel'. Did you mean 'table'"):
-        describe("mug", given={"ground.kind": "tabel"})
+        load_description("mug", given={"ground.kind": "tabel"})
 
 
 def test_a_sweep_refuses_a_photograph_where_there_is_none() -> None:

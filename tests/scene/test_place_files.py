@@ -20,10 +20,19 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.runs.summary import file_digests
 from advsearch.scene.assets import Material, Mesh, Shape
-from advsearch.scene.description import describe
-from advsearch.scene.geometry import standing
-from advsearch.scene.glb import glb
-from advsearch.scene.grounds import LUMINANCE, enclosed, has_lanes, irradiance, past, paved, surroundings_of, view_of
+from advsearch.scene.description import load_description
+from advsearch.scene.geometry import compute_base_vertices
+from advsearch.scene.glb import encode_glb
+from advsearch.scene.grounds import (
+    LUMINANCE,
+    compute_irradiance,
+    find_surroundings,
+    has_lanes,
+    is_enclosed,
+    is_paved,
+    list_view_remarks,
+    make_camera_view,
+)
 from advsearch.scene.library import import_environment, load_environment
 from advsearch.scene.places import place_meshes
 from advsearch.scene.places.place_file import is_place_file, load_bundled_place, read_place_file, split_light
@@ -85,7 +94,7 @@ def street(tmp_path: Path) -> Path:
         box("house", (-10, 5, 0), (10, 9, 6), 0.6),
         box("lamp", (3.8, -4.2, 3), (4.2, -3.8, 3.1), 0.8),
     ]
-    (folder / "street.glb").write_bytes(glb(shapes))
+    (folder / "street.glb").write_bytes(encode_glb(shapes))
     sky = np.full((16, 32, 3), 0.8, np.float32)
     sky[8:] = 0.2
     (folder / "sky.exr").write_bytes(exr(sky))
@@ -100,45 +109,45 @@ def write(path: Path, **changes: object) -> Path:
 
 
 def test_a_street_of_ones_own_stands_around_the_object_to_scale(street: Path) -> None:
-    scene = describe("car", street)
-    assert {"road", "house", "lamp"} == {name for name, part in scene.around.items() if part.laid}
-    assert paved(scene) and enclosed(scene) and has_lanes(scene)
-    house = standing(scene.around["house"]) * scene.metres
+    scene = load_description("car", street)
+    assert {"road", "house", "lamp"} == {name for name, part in scene.surrounding_meshes.items() if part.is_laid_ground}
+    assert is_paved(scene) and is_enclosed(scene) and has_lanes(scene)
+    house = compute_base_vertices(scene.surrounding_meshes["house"]) * scene.metres
     np.testing.assert_allclose([house.min(axis=0), house.max(axis=0)], [[-10, 5, 0], [10, 9, 6]], atol=1e-4)
-    assert scene.around["road"].material.specular == pytest.approx(0.25)
+    assert scene.surrounding_meshes["road"].material.specular == pytest.approx(0.25)
     assert scene.environment is not None and scene.environment.name == "my-street"
     assert scene.notes == (), scene.notes
-    assert not paved(describe("car", street, given={"ground.kind": "table"}))
-    assert not describe("car", street, given={"ground.size": 0.0}).around
-    assert not has_lanes(describe("car", write(street, lane_width=None)))
+    assert not is_paved(load_description("car", street, given={"ground.kind": "table"}))
+    assert not load_description("car", street, given={"ground.size": 0.0}).surrounding_meshes
+    assert not has_lanes(load_description("car", write(street, lane_width=None)))
 
 
 def test_the_light_of_a_place_has_a_unit_and_its_lamps_shine_by_night(street: Path) -> None:
-    day, night = describe("car", street), describe("car", f"{street}#night")
+    day, night = load_description("car", street), load_description("car", f"{street}#night")
     lit = import_environment(street.parent / "sky.exr")
-    level = float(irradiance(torch.from_numpy(lit.radiance.copy())) @ torch.tensor(LUMINANCE))
+    level = float(compute_irradiance(torch.from_numpy(lit.radiance.copy())) @ torch.tensor(LUMINANCE))
     assert day.environment is not None and night.environment is not None
     assert day.environment.candelas == pytest.approx(20000.0 / level)
-    assert day.around["lamp"].emission is None
-    shown = night.around["lamp"].emission
+    assert day.surrounding_meshes["lamp"].emission is None
+    shown = night.surrounding_meshes["lamp"].emission
     assert shown is not None and night.environment.candelas is not None
     np.testing.assert_allclose(shown[0, 0] * night.environment.candelas, [1000.0, 800.0, 500.0], rtol=1e-5)
     assert night.environment.name == "my-street-night"
     without = write(street, lights={"day": {"map": "noon"}})
-    plain = describe("car", without).environment
+    plain = load_description("car", without).environment
     assert plain is not None and plain.candelas is None
     assert np.array_equal(plain.radiance, load_environment("noon").radiance)
 
 
 def test_notes_say_what_stands_in_a_solid_and_where_a_place_ends(street: Path) -> None:
-    inside = describe("car", street, things="car@0,7; person@4,-4")
+    inside = load_description("car", street, things="car@0,7; person@4,-4")
     assert sum("stands in a house" in note for note in inside.notes) == 1
     assert sum("stands in a post" in note for note in inside.notes) == 1
-    near, far = (describe("car", street, given={"camera.distance": away}) for away in (10.0, 90.0))
-    assert past(near, [view_of(near)]) == ()
-    (said,) = past(far, [view_of(far)])
+    near, far = (load_description("car", street, given={"camera.distance": away}) for away in (10.0, 90.0))
+    assert list_view_remarks(near, [make_camera_view(near)]) == ()
+    (said,) = list_view_remarks(far, [make_camera_view(far)])
     assert "x -30 to 30 m" in said and "the camera is outside" in said
-    (some,) = past(far, [view_of(near), view_of(far)])
+    (some,) = list_view_remarks(far, [make_camera_view(near), make_camera_view(far)])
     assert "50 % of the views are outside" in some
 
 
@@ -156,7 +165,11 @@ def test_a_command_renders_in_it_and_its_files_belong_to_the_run(
 def test_the_picture_shows_the_place(street: Path) -> None:
     scene = load_scene("car", str(street), settings={"camera.distance": 12.0, "camera.azimuth": 270.0})
     renderer = scene.renderer(["pose"], resolution=24, denoise="none")
-    names = {name for name in scene.description.around if bool(renderer.surfaces(renderer.start).seen(name).any())}
+    names = {
+        name
+        for name in scene.description.surrounding_meshes
+        if bool(renderer.surfaces(renderer.start).visible_mask(name).any())
+    }
     assert {"road", "house"} <= names
 
 
@@ -213,7 +226,7 @@ def test_a_file_that_says_something_else_is_refused_with_a_reason(
     (street.parent / "black.exr").write_bytes(exr(np.zeros((16, 32, 3), np.float32)))
     write(street, **changes)
     with pytest.raises(error, match=message):
-        describe("car", street)
+        load_description("car", street)
 
 
 @pytest.mark.parametrize(
@@ -229,14 +242,14 @@ def test_a_file_that_says_something_else_is_refused_with_a_reason(
 def test_text_that_is_no_place_is_refused(street: Path, text: str, message: str) -> None:
     street.write_text(text, "utf-8")
     with pytest.raises(FileFormatError, match=message):
-        describe("car", street)
+        load_description("car", street)
 
 
 def test_what_is_missing_is_named(street: Path) -> None:
     with pytest.raises(UnknownNameError, match=r"unknown light of .*place.yaml: 'nihgt'. Did you mean 'night'\?"):
-        describe("car", f"{street}#nihgt")
+        load_description("car", f"{street}#nihgt")
     with pytest.raises(FileFormatError, match=r"nowhere.yaml: expected the YAML file of a place, got No such file"):
-        describe("car", street.parent / "nowhere.yaml")
+        load_description("car", street.parent / "nowhere.yaml")
 
 
 def test_a_spec_names_a_light_behind_the_file() -> None:
@@ -250,8 +263,8 @@ def test_a_bundled_place_opens_as_one_of_ones_own(name: str) -> None:
     path = BUNDLED / name / "place.yaml"
     own = load_bundled_place(name)
     assert own.notes == () and read_place_file(path) == own.file
-    scene = describe("car" if name != "room" else "mug", path)
-    assert [part.name for part in own.parts] == list(scene.around)
+    scene = load_description("car" if name != "room" else "mug", path)
+    assert [part.name for part in own.parts] == list(scene.surrounding_meshes)
     environment = scene.environment
     assert environment is not None
     if name == "road":  # whose maps have no unit
@@ -264,9 +277,9 @@ def test_a_bundled_place_opens_as_one_of_ones_own(name: str) -> None:
 
 def test_a_road_before_a_picture_holds_as_far_as_the_bundled_street_does() -> None:
     given = {"camera.distance": 30.0, "camera.azimuth": 90.0}
-    own, street = (describe("car", name, given=given) for name in (BUNDLED / "road" / "place.yaml", "street"))
-    assert surroundings_of(own) == surroundings_of(street)
-    assert "the place around the object is a picture" in past(own, [view_of(own)])[0]
+    own, street = (load_description("car", name, given=given) for name in (BUNDLED / "road" / "place.yaml", "street"))
+    assert find_surroundings(own) == find_surroundings(street)
+    assert "the place around the object is a picture" in list_view_remarks(own, [make_camera_view(own)])[0]
 
 
 def test_a_variant_keeps_the_name_of_what_it_changes_as_a_whole(street: Path) -> None:
@@ -288,7 +301,9 @@ def test_a_variant_keeps_the_name_of_what_it_changes_as_a_whole(street: Path) ->
     (street.parent / "street.glb").write_bytes(write_glb(PlaceModel(looks, nodes, {})))
     lights = {name: {"map": "sky.exr", "variant": name} for name in ("wet", "snow")}
     write(street, lamps={}, lights={"dry": {"map": "sky.exr"}, **lights})
-    dry, wet, snow = (describe("car", f"{street}#{light}").around for light in ("dry", "wet", "snow"))
+    dry, wet, snow = (
+        load_description("car", f"{street}#{light}").surrounding_meshes for light in ("dry", "wet", "snow")
+    )
     assert set(dry) == set(wet) == {"road", "house"} and set(snow) == {"road", "house", "snow"}
     assert wet["road"].material == Material(roughness=0.1, specular=0.6, clearcoat=0.5)
     assert dry["road"].material == dull
@@ -330,20 +345,20 @@ def paint_road(street: Path, materials: int, factor: float, nearest: bool = Fals
 
 def test_a_picture_that_many_materials_share_is_counted_for_each(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A picture of few bytes must not become gigabytes of textures, each with a color of its own."""
-    monkeypatch.setattr(place_meshes, "MOST_TEXELS", 1000)
+    monkeypatch.setattr(place_meshes, "MAX_TEXELS", 1000)
     paint_road(street, 10, 0.5)
-    assert len(describe("car", street).around) == 11
+    assert len(load_description("car", street).surrounding_meshes) == 11
     paint_road(street, 20, 0.5)
     with pytest.raises(FileFormatError, match=r"street.glb: expected textures of at most 1,000 texels, counted for"):
-        describe("car", street)
-    paint_road(street, place_meshes.MOST_MESHES, 0.5)
+        load_description("car", street)
+    paint_road(street, place_meshes.MAX_MESHES, 0.5)
     with pytest.raises(InputError, match=r"expected at most 200 materials, got 201"):
-        describe("car", street)
+        load_description("car", street)
 
 
 def test_a_texture_of_sharp_texels_is_enlarged_no_further_than_that_of_an_object(street: Path) -> None:
     paint_road(street, 1, 1.0, nearest=True)
-    assert describe("car", street).around["road"].base_color.shape == (512, 512, 3)
+    assert load_description("car", street).surrounding_meshes["road"].base_color.shape == (512, 512, 3)
 
 
 def test_what_a_place_has_not_is_said(street: Path) -> None:
@@ -357,6 +372,6 @@ def test_what_a_place_has_not_is_said(street: Path) -> None:
         header["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
 
     rewrite_header(street.parent / "street.glb", add)
-    notes = describe("car", street).notes
+    notes = load_description("car", street).notes
     for word in ("colours of vertices", "skins or animations", "has lights"):
         assert sum(word in note for note in notes) == 1, notes

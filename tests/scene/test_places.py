@@ -8,9 +8,9 @@ import torch
 
 from advsearch.engine.loading import load_scene
 from advsearch.scene import library
-from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.geometry import footprint, overlapping, standing
-from advsearch.scene.grounds import LUMINANCE, enclosed, paved
+from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.geometry import compute_base_vertices, compute_footprint, is_overlapping
+from advsearch.scene.grounds import LUMINANCE, is_enclosed, is_paved
 from scenes.places import crossing, room
 from scenes.places.avenue import KERB, StreetPlan, lamp_places
 
@@ -21,16 +21,20 @@ PLACES = {"crossing": "car", "car-park": "car", "room": "mug"}
 
 
 def metres(scene: SceneDescription) -> dict[str, np.ndarray]:
-    return {name: standing(part) * scene.metres for name, part in scene.around.items()}
+    return {name: compute_base_vertices(part) * scene.metres for name, part in scene.surrounding_meshes.items()}
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize("place", PLACES)
 def test_a_place_comes_with_its_environment_and_its_faces_look_outwards(place: str) -> None:
-    scene = describe(PLACES[place], place)
-    assert all(part.laid for part in scene.around.values()) and paved(scene) and enclosed(scene)
-    assert not describe(PLACES[place], place, given={"ground.size": 0.0}).around
-    for name, part in scene.around.items():
+    scene = load_description(PLACES[place], place)
+    assert (
+        all(part.is_laid_ground for part in scene.surrounding_meshes.values())
+        and is_paved(scene)
+        and is_enclosed(scene)
+    )
+    assert not load_description(PLACES[place], place, given={"ground.size": 0.0}).surrounding_meshes
+    for name, part in scene.surrounding_meshes.items():
         corners = part.mesh.vertices.astype(np.float64)[part.mesh.faces]
         faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         agree = (faces * part.mesh.normals[part.mesh.faces].mean(axis=1)).sum(axis=1) >= 0.0
@@ -41,19 +45,19 @@ def test_a_place_comes_with_its_environment_and_its_faces_look_outwards(place: s
 @pytest.mark.medium
 @pytest.mark.parametrize("place", PLACES)
 def test_nothing_stands_where_the_object_is(place: str) -> None:
-    scene = describe(PLACES[place], place)
-    thing, low = footprint(scene.base_vertices * scene.metres), -0.001
+    scene = load_description(PLACES[place], place)
+    thing, low = compute_footprint(scene.base_vertices * scene.metres), -0.001
     ground = ("road", "floor", "plain")
-    for name, part in scene.around.items():
+    for name, part in scene.surrounding_meshes.items():
         if name in ground:
             continue
-        corners = (standing(part) * scene.metres)[part.mesh.faces.astype(np.int64)]
+        corners = (compute_base_vertices(part) * scene.metres)[part.mesh.faces.astype(np.int64)]
         near = (corners.min(axis=1)[:, :2] < thing.outline.max(axis=0)) & (
             corners.max(axis=1)[:, :2] > thing.outline.min(axis=0)
         )
-        upright = (corners[..., 2].max(axis=1) > 0.01) & (corners[..., 2].min(axis=1) < thing.high)
+        upright = (corners[..., 2].max(axis=1) > 0.01) & (corners[..., 2].min(axis=1) < thing.upper)
         assert not (near.all(axis=1) & upright).any() or name in ("walls", "lamp", "trees"), name
-    assert low < thing.low < 0.01
+    assert low < thing.lower < 0.01
 
 
 @pytest.mark.medium
@@ -82,38 +86,38 @@ def test_posts_and_trees_stand_on_pavements_or_between_bays(plan: StreetPlan) ->
 
 @pytest.mark.medium
 def test_the_crossing_has_a_stop_sign_that_faces_who_comes_and_a_zebra_ahead() -> None:
-    scene = describe("car", "crossing")
+    scene = load_description("car", "crossing")
     parts = {name: part for name, part in metres(scene).items() if name in ("sign", "sign-metal", "sign-tube")}
     sign = np.concatenate(list(parts.values()))
     assert sign[:, 2].min() == pytest.approx(KERB + crossing.SIGN_LOW, abs=1e-3)
     assert np.ptp(sign[:, 2]) == pytest.approx(library.load_object("stop-sign").metres, rel=1e-3)
-    face = scene.around["sign"].mesh
+    face = scene.surrounding_meshes["sign"].mesh
     assert face.normals[face.faces].mean(axis=(0, 1))[0] < -0.9  # it faces where the object comes from
     road = metres(scene)["road"]
     paint = road[np.abs(road[:, 2] - 0.004) < 1e-4]
     zebra = paint[(np.abs(paint[:, 0] - crossing.ZEBRA[0]) < 1e-3) & (paint[:, 1] > -2.0) & (paint[:, 1] < 5.6)]
     widths = np.diff(np.unique(np.round(zebra[:, 1], 3)))
     assert len(widths) > 10 and widths == pytest.approx(np.full(len(widths), crossing.STRIPE), abs=1e-3)
-    car = footprint(scene.base_vertices * scene.metres)
+    car = compute_footprint(scene.base_vertices * scene.metres)
     assert car.outline[:, 0].max() < crossing.STOP[0], "the car is beyond the stop line"
 
 
 def test_a_bay_is_as_large_as_bays_are_and_the_car_is_in_one() -> None:
-    scene = describe("car", "car-park")
-    car = footprint(scene.base_vertices * scene.metres)
+    scene = load_description("car", "car-park")
+    car = compute_footprint(scene.base_vertices * scene.metres)
     assert np.abs(car.outline[:, 0]).max() < crossing.DEEP / 2.0 and np.abs(car.outline[:, 1]).max() < 1.2
     row = min(crossing.ROWS, key=abs)
     assert row == -crossing.DEEP / 2.0
-    neighbour = describe("car", "car-park", things="car@0,2.5")
-    beside = footprint(standing(neighbour.meshes["car"]) * neighbour.metres)
-    assert not overlapping(car, beside) and not any("stand in" in one for one in neighbour.notes)
+    neighbour = load_description("car", "car-park", things="car@0,2.5")
+    beside = compute_footprint(compute_base_vertices(neighbour.meshes["car"]) * neighbour.metres)
+    assert not is_overlapping(car, beside) and not any("stand in" in one for one in neighbour.notes)
 
 
 def test_things_stand_on_the_table_and_beyond_it_on_the_floor() -> None:
-    scene = describe("mug", "room", things="bottle@0.2,0.2; chair@0,1.2")
-    low = {name: float((standing(scene.meshes[name]) * scene.metres)[:, 2].min()) for name in scene.things}
+    scene = load_description("mug", "room", things="bottle@0.2,0.2; chair@0,1.2")
+    low = {name: float((compute_base_vertices(scene.meshes[name]) * scene.metres)[:, 2].min()) for name in scene.things}
     assert low == pytest.approx({"bottle": 0.0, "chair": room.LOW[2]}, abs=1e-4)
-    assert describe("mug", "room").meshes["furniture"].laid
+    assert load_description("mug", "room").meshes["furniture"].is_laid_ground
 
 
 @pytest.mark.medium
@@ -123,12 +127,12 @@ def test_things_stand_on_the_table_and_beyond_it_on_the_floor() -> None:
 def test_by_day_the_window_lights_the_room_and_in_the_evening_the_lamp(
     environment: str, shining: str, luminance: float | None
 ) -> None:
-    scene = describe("mug", environment)
+    scene = load_description("mug", environment)
     unit = scene.environment
     assert unit is not None and unit.candelas is not None
     means = {
         name: float((part.emission.mean(axis=(0, 1)) @ np.array(LUMINANCE)) * unit.candelas)
-        for name, part in scene.around.items()
+        for name, part in scene.surrounding_meshes.items()
         if part.emission is not None
     }
     assert max(means, key=lambda name: means[name]) == shining
@@ -147,5 +151,5 @@ def test_other_lights_of_a_place_have_the_maps_of_the_avenue(place: str) -> None
         one, other = library.load_environment(f"{place}{light}"), library.load_environment(f"avenue{light}")
         assert np.array_equal(one.radiance, other.radiance) and one.candelas == other.candelas
         assert one.name == f"{place}{light}" and one.ground == place
-    assert describe("car", f"{place}-night").around["street-lamps"].emission is not None
-    assert describe("car", place).around["street-lamps"].emission is None
+    assert load_description("car", f"{place}-night").surrounding_meshes["street-lamps"].emission is not None
+    assert load_description("car", place).surrounding_meshes["street-lamps"].emission is None

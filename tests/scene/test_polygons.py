@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from advsearch.scene.importing import geometry
-from advsearch.scene.importing.geometry import triangulated
+from advsearch.scene.importing.geometry import triangulate
 
 
 def doubled(corners: np.ndarray) -> np.ndarray:
@@ -38,7 +38,7 @@ def test_star_shaped_polygons_are_covered_once(counts: list[int], seed: int, clo
         shape = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(count, 0.3)], axis=1)
         shapes.append(np.roll(shape[::-1] if clockwise else shape, random.integers(count), axis=0))
     points = np.concatenate(shapes) * random.uniform(1e-3, 1e3) + random.uniform(-5.0, 5.0, 3)
-    triangles, owner, wrong = triangulated(points, np.array(counts))
+    triangles, owner, wrong = triangulate(points, np.array(counts))
     areas, starts = doubled(points[triangles]), np.cumsum([0, *counts])
     assert wrong == 0 and np.array_equal(np.bincount(owner), np.array(counts) - 2)
     for number, (low, high) in enumerate(pairwise(starts)):
@@ -57,24 +57,24 @@ def test_a_comb_a_hole_and_corners_in_line(tilt: float) -> None:
     for shape, area in ((comb, 50 * 5 + 100), (ring, 12.0), (line, 4.0)):
         flat = np.array([(x, y, 0.0) for x, y in shape])
         turn = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
-        triangles, _, wrong = triangulated(flat @ turn.T, np.array([len(flat)]))
+        triangles, _, wrong = triangulate(flat @ turn.T, np.array([len(flat)]))
         assert wrong == 0 and doubled(flat[triangles]).sum() / 2.0 == pytest.approx(area)
         assert (doubled(flat[triangles]) > 1e-9).all()  # each corner of a line is used, so that no seam opens
 
 
 def test_a_convex_polygon_is_a_fan() -> None:
     square = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0.1), (0, 1, 0)], dtype=np.float64)
-    assert triangulated(square, np.array([4]))[0].tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert triangulate(square, np.array([4]))[0].tolist() == [[0, 1, 2], [0, 2, 3]]
     dart = np.array([(0, 0, 0), (2, 1, 0), (0, 2, 0), (0.5, 1, 0)], dtype=np.float64)
-    assert sorted(map(sorted, triangulated(dart, np.array([4]))[0].tolist())) == [[0, 1, 3], [1, 2, 3]]
+    assert sorted(map(sorted, triangulate(dart, np.array([4]))[0].tolist())) == [[0, 1, 3], [1, 2, 3]]
 
 
 def test_what_crosses_itself_is_counted_and_work_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
     star = np.array([(np.cos(4 * np.pi * k / 5), np.sin(4 * np.pi * k / 5), 0.0) for k in range(5)])
-    triangles, _, wrong = triangulated(star, np.array([5]))
+    triangles, _, wrong = triangulate(star, np.array([5]))
     assert triangles.shape == (3, 3) and wrong in (0, 1)
     wild = np.random.default_rng(0).normal(size=(400, 3))
     monkeypatch.setattr(geometry, "MOST_WORK", 1000)
-    triangles, owner, wrong = triangulated(wild, np.array([200, 200]))
+    triangles, owner, wrong = triangulate(wild, np.array([200, 200]))
     assert wrong == 2 and triangles.shape == (396, 3) and np.array_equal(np.bincount(owner), [198, 198])
-    assert triangulated(np.full((4, 3), np.nan), np.array([4]))[0].shape == (2, 3)
+    assert triangulate(np.full((4, 3), np.nan), np.array([4]))[0].shape == (2, 3)

@@ -11,7 +11,7 @@ import torch
 
 import advsearch
 from advsearch.errors import InputError
-from advsearch.scene.mitsuba_backend.own_plugins import APERTURE, DISTANCE, WATER, raindrops
+from advsearch.scene.mitsuba_backend.own_plugins import APERTURE_RADIUS, SHEET_DISTANCE, WATER_IOR, sample_raindrops
 from advsearch.scene.mitsuba_backend.variant import mi
 
 pytestmark = pytest.mark.usefixtures("two_threads")
@@ -45,7 +45,7 @@ def bent(direction: np.ndarray, normal: np.ndarray, first: float, second: float)
 
 def expected(ahead: np.ndarray, lens: np.ndarray, drops: np.ndarray) -> tuple[np.ndarray, float]:
     """One ray through the drop that is tallest where it meets the sheet."""
-    place = ahead[:2] / ahead[2] * DISTANCE + lens
+    place = ahead[:2] / ahead[2] * SHEET_DISTANCE + lens
     best, tall = None, 0.0
     for x, y, radius, curve in drops.astype(float):
         away = math.hypot(place[0] - x, place[1] - y)
@@ -56,13 +56,13 @@ def expected(ahead: np.ndarray, lens: np.ndarray, drops: np.ndarray) -> tuple[np
     if best is None:
         return ahead, 1.0
     x, y, radius, curve = best
-    inner, first = bent(ahead, np.array([0.0, 0.0, 1.0]), 1.0, WATER)
+    inner, first = bent(ahead, np.array([0.0, 0.0, 1.0]), 1.0, WATER_IOR)
     assert inner is not None
     middle = np.array([x, y, -math.sqrt(curve**2 - radius**2)])
     start = np.array([*place, 0.0]) - middle
     a, b, c = inner @ inner, 2.0 * inner @ start, start @ start - curve**2
     hit = start + inner * (-b + math.sqrt(b * b - 4.0 * a * c)) / (2.0 * a)
-    outer, second = bent(inner, hit / curve, WATER, 1.0)
+    outer, second = bent(inner, hit / curve, WATER_IOR, 1.0)
     return (ahead, 0.0) if outer is None or outer[2] <= 0.0 else (outer, first * second)
 
 
@@ -70,14 +70,14 @@ def expected(ahead: np.ndarray, lens: np.ndarray, drops: np.ndarray) -> tuple[np
 def test_rays_are_refracted_by_snells_law_and_lose_what_fresnel_says() -> None:
     renderer = renderer_of(25)
     sensor = renderer.scene._scene.sensors()[0]
-    _, drops, _ = raindrops(25, 3.0, 0, math.tan(math.radians(35.0) / 2.0))
+    _, drops, _ = sample_raindrops(25, 3.0, 0, math.tan(math.radians(35.0) / 2.0))
     random = np.random.default_rng(1)
     u, v, lens = random.random(600), random.random(600), random.random((600, 2))
     place, sample = mi.Point2f(u, v), mi.Point2f(lens[:, 0], lens[:, 1])
     ray, weight = sensor.sample_ray(0.0, 0.5, place, sample)
     clear, _ = sensor.sample_ray_without_drops(0.0, place)
     to_camera = np.array(sensor.world_transform().matrix).reshape(4, 4)[:3, :3].T
-    shift = APERTURE * np.array(mi.warp.square_to_uniform_disk_concentric(sample)).T
+    shift = APERTURE_RADIUS * np.array(mi.warp.square_to_uniform_disk_concentric(sample)).T
     ours, before = (np.array(one.d).T @ to_camera.T for one in (ray, clear))
     shares, changed, near = np.array(weight).T[:, 0], 0, 0
     for k in range(600):
@@ -92,10 +92,10 @@ def test_a_drop_shows_the_scene_upside_down() -> None:
     """Above the middle of a drop the camera looks down behind it, as far as a lens of its focal length bends."""
     radius, curve, up = 3.0, 4.5, 0.3
     for sign in (1.0, -1.0):
-        ahead = np.array([0.0, sign * up, DISTANCE]) / math.hypot(up, DISTANCE)
+        ahead = np.array([0.0, sign * up, SHEET_DISTANCE]) / math.hypot(up, SHEET_DISTANCE)
         out, _ = expected(ahead, np.zeros(2), np.array([[0.0, 0.0, radius, curve]]))
         turned = math.atan2(out[1], out[2]) - math.atan2(ahead[1], ahead[2])
-        assert turned == pytest.approx(-sign * up * (WATER - 1.0) / curve, rel=0.1)
+        assert turned == pytest.approx(-sign * up * (WATER_IOR - 1.0) / curve, rel=0.1)
 
 
 @pytest.mark.medium
@@ -124,8 +124,8 @@ def test_a_textures_derivative_goes_through_the_drops() -> None:
 
 
 def test_other_drops_come_by_another_seed_and_a_rig_has_none() -> None:
-    (_, first, grid), (_, second, _) = (raindrops(30, 1.5, seed, 0.5) for seed in (0, 1))
+    (_, first, grid), (_, second, _) = (sample_raindrops(30, 1.5, seed, 0.5) for seed in (0, 1))
     assert not np.array_equal(first, second)
-    assert np.array_equal(grid, raindrops(30, 1.5, 0, 0.5)[2])
+    assert np.array_equal(grid, sample_raindrops(30, 1.5, 0, 0.5)[2])
     with pytest.raises(InputError, match=r"camera\.drops: expected a number from 0 to 2000"):
         renderer_of(-1)

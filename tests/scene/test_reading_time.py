@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import Names, Notes
-from advsearch.scene.importing.mtl_surfaces import map_of
+from advsearch.scene.importing.files import Notes, UniqueNames
+from advsearch.scene.importing.mtl_surfaces import parse_map
 from advsearch.scene.importing.objects import read_parts
-from advsearch.scene.importing.scenes import node_names
-from advsearch.scene.importing.wavefront import MOST_NAMED
-from advsearch.scene.mitsuba_backend.xml_files import MOST_ELEMENTS, read_scene
+from advsearch.scene.importing.scenes import list_node_names
+from advsearch.scene.importing.wavefront import MAX_MATERIALS
+from advsearch.scene.mitsuba_backend.xml_files import MAX_ELEMENTS, read_scene
 
 POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 ENOUGH = 20.0
@@ -31,32 +31,32 @@ def read(folder: Path, text: str) -> list[str]:
 def notes(folder: Path) -> None:
     found = Notes("a.obj")
     for number in range(200_000):
-        found.say(f"note {number}")
-        found.say("the same")
+        found.warn(f"note {number}")
+        found.warn("the same")
     assert len(list(found)) == 200_001
 
 
 def names(folder: Path) -> None:
-    free = Names()
-    free.free("a-3")
-    assert [free.free("a") for _ in range(100_000)][:3] == ["a", "a-2", "a-4"]
+    free = UniqueNames()
+    free.make_unique("a-3")
+    assert [free.make_unique("a") for _ in range(100_000)][:3] == ["a", "a-2", "a-4"]
 
 
 def numbers(folder: Path) -> None:
-    assert map_of("-o " + "1" * 100_000 + "x.png") is not None
+    assert parse_map("-o " + "1" * 100_000 + "x.png") is not None
 
 
 def material_files(folder: Path) -> None:
-    lines = "".join(f"mtllib m{number}.mtl\n" for number in range(MOST_NAMED))
-    assert len(read(folder, lines + POINTS + "f 1 2 3\n")) == MOST_NAMED
-    assert len(read(folder, "mtllib m.mtl\n" * 10 * MOST_NAMED + POINTS + "f 1 2 3\n")) == 1
+    lines = "".join(f"mtllib m{number}.mtl\n" for number in range(MAX_MATERIALS))
+    assert len(read(folder, lines + POINTS + "f 1 2 3\n")) == MAX_MATERIALS
+    assert len(read(folder, "mtllib m.mtl\n" * 10 * MAX_MATERIALS + POINTS + "f 1 2 3\n")) == 1
 
 
 def shapes(folder: Path) -> None:
     path = folder / "a.xml"
-    path.write_text('<scene version="3.0.0">' + '<shape type="sphere"/>' * (MOST_ELEMENTS - 1) + "</scene>")
+    path.write_text('<scene version="3.0.0">' + '<shape type="sphere"/>' * (MAX_ELEMENTS - 1) + "</scene>")
     found = read_scene(path)
-    assert len(found) == MOST_ELEMENTS and f"sphere-{MOST_ELEMENTS - 1}" in found
+    assert len(found) == MAX_ELEMENTS and f"sphere-{MAX_ELEMENTS - 1}" in found
 
 
 def nodes(folder: Path) -> None:
@@ -71,7 +71,7 @@ def nodes(folder: Path) -> None:
         "accessors": [{"componentType": 5126, "count": 3, "type": "VEC3", "min": [0, 0, 0], "max": [1, 1, 1]}],
     }
     path.write_text(json.dumps(header))
-    assert len(node_names(path)) == count + 15_000
+    assert len(list_node_names(path)) == count + 15_000
 
 
 @pytest.mark.medium
@@ -83,7 +83,7 @@ def test_reading_takes_time_in_proportion(tmp_path: Path, what: Callable[[Path],
 
 
 def test_a_file_that_names_too_many_is_refused(tmp_path: Path) -> None:
-    many = range(MOST_NAMED + 1)
+    many = range(MAX_MATERIALS + 1)
     for lines in (
         "".join(f"mtllib m{number}.mtl\n" for number in many),
         "mtllib " + " ".join(f"m{number}.mtl" for number in many) + "\n",

@@ -19,7 +19,7 @@ import advsearch
 from advsearch.controls import make_control, make_space
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.importing.texture import sampled
+from advsearch.scene.importing.texture import sample_texture
 
 TALL = (0.4, 0.6, 1.0)
 """Extents of the test body, z up."""
@@ -168,8 +168,8 @@ def test_a_texture_is_looked_up_by_the_coordinates_that_its_material_names(tmp_p
     asset = import_object(file, facing="+x")
     left = asset.mesh.vertices[:, 0] < 0.0
     inside = (asset.mesh.uvs * 0.8 + 0.1).astype(np.float64)
-    assert sampled(asset.base_color, inside[left]).mean() < 0.2
-    assert sampled(asset.base_color, inside[~left]).mean() > 0.7
+    assert sample_texture(asset.base_color, inside[left]).mean() < 0.2
+    assert sample_texture(asset.base_color, inside[~left]).mean() > 0.7
     file.write_text(two_maps(0))
     assert np.ptp(import_object(file).mesh.uvs[:, 0]) > 0.5 and "unwrapped anew" in " ".join(
         import_object(file).warnings

@@ -13,9 +13,9 @@ from torch import Tensor
 from advsearch.controls import TextureControl, make_space
 from advsearch.engine.loading import load_scene, make_renderer
 from advsearch.errors import InputError
-from advsearch.scene.color import linear_to_srgb, srgb_to_linear, to_8_bit
-from advsearch.scene.description import describe
-from advsearch.scene.formation import EVERYTHING, ImageFormation
+from advsearch.scene.color import linear_to_srgb, round_to_8_bit, srgb_to_linear
+from advsearch.scene.description import load_description
+from advsearch.scene.formation import ALL_OMISSIONS, ImageFormation
 from advsearch.scene.mitsuba_backend.scene import BASE_COLOR, MitsubaScene
 from advsearch.scene.renderer import Renderer
 
@@ -84,7 +84,7 @@ def test_a_gradient_leaves_the_scene_as_it_was(raw: Renderer) -> None:
 
 
 def test_an_interrupted_gradient_leaves_nothing_behind(raw: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
-    base = raw.scene.radiance({}, 5, 4)
+    base = raw.scene.render_radiance({}, 5, 4)
 
     class Interrupted:
         def render_backward(self, *_: object, **__: object) -> None:
@@ -92,45 +92,47 @@ def test_an_interrupted_gradient_leaves_nothing_behind(raw: Renderer, monkeypatc
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setitem(raw.scene._integrators, ("path", raw.scene.depth), Interrupted())
-        raw.scene.adjoint({BASE_COLOR: torch.zeros(TEXELS, TEXELS, 3)}, torch.ones(SIZE, SIZE, 3), 1, 4)
-    assert torch.equal(base, raw.scene.radiance({}, 5, 4))
+        raw.scene.render_adjoint({BASE_COLOR: torch.zeros(TEXELS, TEXELS, 3)}, torch.ones(SIZE, SIZE, 3), 1, 4)
+    assert torch.equal(base, raw.scene.render_radiance({}, 5, 4))
 
 
 def test_inputs_that_are_not_named_have_their_base_value(raw: Renderer) -> None:
-    base = raw.scene.radiance({}, 5, 4)
-    raw.scene.radiance({BASE_COLOR: torch.zeros(TEXELS, TEXELS, 3)}, 5, 4)
-    assert torch.equal(base, raw.scene.radiance({}, 5, 4))
+    base = raw.scene.render_radiance({}, 5, 4)
+    raw.scene.render_radiance({BASE_COLOR: torch.zeros(TEXELS, TEXELS, 3)}, 5, 4)
+    assert torch.equal(base, raw.scene.render_radiance({}, 5, 4))
 
 
 def test_a_tensor_changed_in_place_is_uploaded_again(raw: Renderer) -> None:
     texture = torch.full((TEXELS, TEXELS, 3), 0.2)
-    dark = raw.scene.radiance({BASE_COLOR: texture}, 5, 4)
+    dark = raw.scene.render_radiance({BASE_COLOR: texture}, 5, 4)
     texture += 0.5
-    assert float(raw.scene.radiance({BASE_COLOR: texture}, 5, 4).mean()) > 1.1 * float(dark.mean())
+    assert float(raw.scene.render_radiance({BASE_COLOR: texture}, 5, 4).mean()) > 1.1 * float(dark.mean())
 
 
 @pytest.mark.medium
 def test_a_recording_survives_the_birth_and_death_of_other_scenes(raw: Renderer) -> None:
     """Dr.Jit leaves undefined what happens when a recording is replayed after the scenes in memory have changed."""
-    before = raw.scene.radiance({}, 1, 4)
+    before = raw.scene.render_radiance({}, 1, 4)
     for name in ("ball", "book"):
-        other = MitsubaScene(describe(name), (SIZE, SIZE))
-        other.adjoint({BASE_COLOR: other.base(BASE_COLOR)}, torch.ones(SIZE, SIZE, 3), 1, 4)
-        assert torch.equal(raw.scene.radiance({}, 1, 4), before)
+        other = MitsubaScene(load_description(name), (SIZE, SIZE))
+        other.render_adjoint({BASE_COLOR: other.get_base_value(BASE_COLOR)}, torch.ones(SIZE, SIZE, 3), 1, 4)
+        assert torch.equal(raw.scene.render_radiance({}, 1, 4), before)
         del other
-        assert torch.equal(raw.scene.radiance({}, 1, 4), before)
+        assert torch.equal(raw.scene.render_radiance({}, 1, 4), before)
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize("size, spp, texels", [(16, 1, 16), (32, 4, 32), (32, 2, 4), (24, 3, 64)])
 def test_recording_kernels_changes_no_byte(size: int, spp: int, texels: int) -> None:
-    description = describe("mug")
+    description = load_description("mug")
     frozen = MitsubaScene(description, (size, size))
-    plain = MitsubaScene(description, (size, size), leave_out=EVERYTHING - {"tracing"})
+    plain = MitsubaScene(description, (size, size), leave_out=ALL_OMISSIONS - {"tracing"})
     for seed in range(5):
         inputs = {BASE_COLOR: torch.full((texels, texels, 3), 0.1 + 0.15 * seed)}
-        assert torch.equal(frozen.radiance(inputs, seed, spp), plain.radiance(inputs, seed, spp))
-        for ours, theirs in zip(frozen.guides(inputs, seed, spp), plain.guides(inputs, seed, spp), strict=True):
+        assert torch.equal(frozen.render_radiance(inputs, seed, spp), plain.render_radiance(inputs, seed, spp))
+        for ours, theirs in zip(
+            frozen.render_guides(inputs, seed, spp), plain.render_guides(inputs, seed, spp), strict=True
+        ):
             assert torch.equal(ours, theirs)
 
 
@@ -149,13 +151,13 @@ def test_the_gradient_agrees_with_a_central_difference_of_the_same_samples(raw: 
 @pytest.mark.medium
 def test_a_loss_linear_in_the_texture_changes_by_step_times_gradient() -> None:
     """Direct light only (paths of two segments) makes radiance linear in reflectance, so the identity is exact."""
-    scene = MitsubaScene(describe("ball"), (SIZE, SIZE), max_depth=2)
-    base = scene.base(BASE_COLOR)
+    scene = MitsubaScene(load_description("ball"), (SIZE, SIZE), max_depth=2)
+    base = scene.get_base_value(BASE_COLOR)
     cotangent = torch.ones(SIZE, SIZE, 3)
-    gradient = scene.adjoint({BASE_COLOR: base}, cotangent, 11, 64)[BASE_COLOR]
+    gradient = scene.render_adjoint({BASE_COLOR: base}, cotangent, 11, 64)[BASE_COLOR]
     step = torch.zeros_like(base)
     step[..., 1] = 0.05
-    before, after = (scene.radiance({BASE_COLOR: base + k * step}, 11, 64).sum() for k in (0.0, 1.0))
+    before, after = (scene.render_radiance({BASE_COLOR: base + k * step}, 11, 64).sum() for k in (0.0, 1.0))
     assert float((gradient * step).sum()) == pytest.approx(float(after - before), rel=2e-3)
 
 
@@ -172,7 +174,7 @@ def test_pictures_guides_and_gradients_have_noise_of_their_own(
 ) -> None:
     """A gradient with the noise of its picture is biased: both are products of the same samples."""
     scene, used = denoised.scene, list[int]()
-    pictures, adjoint = scene.pictures, scene.adjoint
+    pictures, adjoint = scene.render_images, scene.render_adjoint
 
     def pictured(inputs: Mapping[str, Tensor], seeds: Mapping[str, int], spp: int) -> list[Tensor]:
         used.extend(seeds.values())
@@ -232,7 +234,7 @@ def test_what_cannot_be_rendered_is_refused(raw: Renderer) -> None:
     with pytest.raises(InputError, match="denoise: expected one of oidn, none"):
         ImageFormation(denoiser="median")
     with pytest.raises(InputError, match="resolution: expected 8 to 4096"):
-        make_renderer(describe("mug"), make_space([TextureControl()], describe("mug")), 4, "none", 0)
+        make_renderer(load_description("mug"), make_space([TextureControl()], load_description("mug")), 4, "none", 0)
 
 
 # ---- image formation ------------------------------------------------------------------------------------------------
@@ -266,9 +268,9 @@ def test_the_transfer_curve_is_flat_where_it_clips_and_finite_at_black() -> None
 
 
 def test_rounding_to_8_bits_leaves_256_levels() -> None:
-    values = to_8_bit(torch.linspace(0.0, 1.0, 10_000))
+    values = round_to_8_bit(torch.linspace(0.0, 1.0, 10_000))
     assert len(values.unique()) == 256
-    assert torch.equal(to_8_bit(values), values)
+    assert torch.equal(round_to_8_bit(values), values)
 
 
 @pytest.mark.medium
@@ -290,7 +292,7 @@ def test_multijittered_samples_have_the_same_mean_and_less_noise() -> None:
     assert noise["better"] < 0.75 * noise["plain"]
     means = [found.mean(0) for found in pictures.values()]
     assert float((means[0] - means[1]).square().mean()) < (noise["plain"] + noise["better"]) / 8 * 1.5
-    assert better.scene.like(max_depth=3).sampler == "multijitter"
+    assert better.scene.copy_with(max_depth=3).sampler == "multijitter"
 
 
 def test_unknown_samplers_are_refused() -> None:

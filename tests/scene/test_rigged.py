@@ -15,10 +15,10 @@ from test_gltf import FACES, SQUARE, File
 import advsearch
 from advsearch.controls import make_control, make_space
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
-from advsearch.questions.sweep.axes import on_grid, read_axes
-from advsearch.scene.description import describe
+from advsearch.questions.sweep.axes import add_grid_axes, parse_axes
+from advsearch.scene.description import load_description
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.outlines import seen_things
+from advsearch.scene.outlines import find_visible_meshes
 from advsearch.scene.rigged import SkeletonRig
 
 ROUND, RINGS, RADIUS, HEIGHT = 12, 9, 0.2, 2.0
@@ -233,9 +233,9 @@ def test_derivatives_are_those_of_differences(clip: str | None, values: dict[str
     assert isinstance(rig, SkeletonRig)
     ((name, at),) = values.items()
     number, side = torch.tensor(at, dtype=torch.float64, requires_grad=True), torch.Generator().manual_seed(1)
-    random = torch.randn(len(rig.posed({})), 3, generator=side, dtype=torch.float64)
-    (slope,) = torch.autograd.grad((rig.posed({name: number}, clip) * random).sum(), number)
-    up, down = (float((rig.posed({name: number.detach() + h}, clip) * random).sum()) for h in (1e-6, -1e-6))
+    random = torch.randn(len(rig.pose({})), 3, generator=side, dtype=torch.float64)
+    (slope,) = torch.autograd.grad((rig.pose({name: number}, clip) * random).sum(), number)
+    up, down = (float((rig.pose({name: number.detach() + h}, clip) * random).sum()) for h in (1e-6, -1e-6))
     assert float(slope) == pytest.approx((up - down) / 2e-6, rel=1e-5)
 
 
@@ -243,7 +243,7 @@ def test_derivatives_are_those_of_differences(clip: str | None, values: dict[str
 
 
 def space_of(path: Path, **settings: object) -> Any:
-    return make_space([make_control("body", settings)], describe(str(path)))
+    return make_space([make_control("body", settings)], load_description(str(path)))
 
 
 def test_by_itself_the_control_plays_the_first_clip(tmp_path: Path) -> None:
@@ -317,7 +317,7 @@ def test_true_boxes_follow(tmp_path: Path) -> None:
         focal = side / 2.0 / math.tan(math.radians(25.0)) / -(relative @ back)
         columns = side / 2.0 + focal * (relative @ right)
         rows = side / 2.0 - focal * (relative @ np.cross(back, right))
-        (found,) = seen_things(renderer, torch.tensor([time]))
+        (found,) = find_visible_meshes(renderer, torch.tensor([time]))
         wanted = columns.min(), rows.min(), columns.max(), rows.max()
         assert np.abs(np.array(found.box) - wanted).max() <= 1.0, (found.box, wanted)
 
@@ -390,11 +390,11 @@ def test_numbers_that_leave_all_bounds_are_refused_when_they_do(tmp_path: Path) 
 
 
 def test_a_grid_goes_over_time_joints_and_weights(tmp_path: Path) -> None:
-    scene = describe(str(figure().write(tmp_path)))
+    scene = load_description(str(figure().write(tmp_path)))
     clip = make_control("body", {"clip": "Bend"})
-    axes = read_axes({"body.time": "0:1:3", "body.upper-L.x": [0, 20], "body.fat-top.weight": [0, 1]}, [clip])
+    axes = parse_axes({"body.time": "0:1:3", "body.upper-L.x": [0, 20], "body.fat-top.weight": [0, 1]}, [clip])
     assert [axis.values for axis in axes] == [(0.0, 0.5, 1.0), (0.0, 20.0), (0.0, 1.0)]
-    (control,) = on_grid([clip], axes, scene)
+    (control,) = add_grid_axes([clip], axes, scene)
     space = make_space([control], scene)
-    assert control.settings()["clip"] == "Bend" and len(space.start) == 3
-    assert len(make_space(on_grid([], read_axes({"body.time": [0, 0.5]}, []), scene), scene).start) == 1
+    assert control.to_settings()["clip"] == "Bend" and len(space.start) == 3
+    assert len(make_space(add_grid_axes([], parse_axes({"body.time": [0, 0.5]}, []), scene), scene).start) == 1

@@ -11,10 +11,10 @@ from advsearch.controls.camera import CameraControl
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.errors import InputError
-from advsearch.scene.description import describe
+from advsearch.scene.description import load_description
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.grounds import paved
-from advsearch.scene.raster import texels_of_faces
+from advsearch.scene.grounds import is_paved
+from advsearch.scene.raster import find_exclusive_texels
 from scenes.places.road import reflectance
 
 SIZE = 16
@@ -28,29 +28,29 @@ def picture(scene: Scene) -> torch.Tensor:
 @pytest.mark.medium
 def test_a_street_brings_its_road_and_a_table_takes_its_place() -> None:
     street = load_scene("car", "street")
-    assert paved(street.description)
-    assert not paved(load_scene("car", "noon").description)
+    assert is_paved(street.description)
+    assert not is_paved(load_scene("car", "noon").description)
     for given in ({"ground.kind": "table"}, {"ground.size": 2.0}, {"ground.size": 0.0}, {"ground.red": 0.5}):
-        assert not paved(street.with_settings(given).description), given
-        assert not paved(describe("car", "street", given=given)), given
-    assert paved(load_scene("mug", "noon", settings={"ground.kind": "road"}).description)
+        assert not is_paved(street.with_settings(given).description), given
+        assert not is_paved(load_description("car", "street", given=given)), given
+    assert is_paved(load_scene("mug", "noon", settings={"ground.kind": "road"}).description)
     with pytest.raises(InputError, match=r"ground.kind=wet-road and `set` ground.red contradict each other"):
-        describe("car", "street", given={"ground.kind": "wet-road", "ground.red": 0.5})
+        load_description("car", "street", given={"ground.kind": "wet-road", "ground.red": 0.5})
 
 
 @pytest.mark.medium
 def test_another_environment_brings_its_own_ground() -> None:
     street, wet = (load_scene("car", name) for name in ("street", "street-wet"))
-    lit = street.lit_by(wet.description.environment)
-    dry, damp = (one.description.around["road"] for one in (street, lit))
+    lit = street.with_environment(wet.description.environment)
+    dry, damp = (one.description.surrounding_meshes["road"] for one in (street, lit))
     assert damp.material.roughness < dry.material.roughness
     assert damp.base_color.mean() < dry.base_color.mean()
-    assert not paved(street.lit_by(load_scene("mug", "noon").description.environment).description)
+    assert not is_paved(street.with_environment(load_scene("mug", "noon").description.environment).description)
 
 
 def test_a_road_has_its_size_in_metres_whatever_stands_on_it() -> None:
     car, sign = (load_scene(name, "street").description for name in ("car", "stop-sign"))
-    extents = [np.ptp(one.around["road"].mesh.vertices, axis=0) * one.metres for one in (car, sign)]
+    extents = [np.ptp(one.surrounding_meshes["road"].mesh.vertices, axis=0) * one.metres for one in (car, sign)]
     np.testing.assert_allclose(extents[0], extents[1], rtol=1e-5)
     assert extents[0][0] == pytest.approx(120.0)
     lane, line, pavement = reflectance(np.array([4.0, 1.0, 0.3]), np.array([0.0, 1.75, -4.2]))
@@ -62,17 +62,17 @@ def test_the_road_is_seen_and_hidden() -> None:
     street = load_scene("car", "street", settings={"camera.elevation": 30.0})
     with_road, without = picture(street), picture(street.with_settings({"ground.size": 0.0}))
     assert float((with_road - without).abs().mean()) > 0.01
-    assert not paved(BackgroundControl(ground="hide").prepare(street.description))
-    assert paved(BackgroundControl(ground="keep").prepare(street.description))
+    assert not is_paved(BackgroundControl(ground="hide").prepare(street.description))
+    assert is_paved(BackgroundControl(ground="keep").prepare(street.description))
 
 
 @pytest.mark.parametrize(("name", "metres"), [("car", 4.3), ("chair", 0.92)])
 def test_distances_are_in_metres_where_the_object_has_a_size(name: str, metres: float) -> None:
-    scene = describe(name, given={"camera.distance": 10.0})
+    scene = load_description(name, given={"camera.distance": 10.0})
     middle = (scene.object.mesh.vertices.min(axis=0) + scene.object.mesh.vertices.max(axis=0)) / 2.0
     away = float(np.linalg.norm(camera_to_world(scene)[:3, 3] - middle))
     assert away == pytest.approx(10.0 / metres, rel=0.01)
-    bound = CameraControl(distance=[10.0, 30.0], azimuth=[0, 90]).bind(describe(name))
+    bound = CameraControl(distance=[10.0, 30.0], azimuth=[0, 90]).bind(load_description(name))
     u = torch.tensor([0.0] * len(bound.start))
     said = bound.describe(u)["camera.distance"]
     assert said == {"value": pytest.approx(10.0), "unit": "metres"}
@@ -82,9 +82,9 @@ def test_distances_are_in_metres_where_the_object_has_a_size(name: str, metres: 
 
 def test_what_is_not_said_of_the_distance_follows_the_object_in_its_unit() -> None:
     control = CameraControl()
-    (distance,) = (one for one in control.own if one.name == "distance")
-    scene = describe("car")
-    there = control.within(scene).in_scene(distance)
+    (distance,) = (one for one in control.instance_parameters if one.name == "distance")
+    scene = load_description("car")
+    there = control.with_scene(scene).resolve_parameter(distance)
     fitted, (low, high) = there.default, there.search or (0.0, 0.0)
     assert (low, high) == pytest.approx((0.8 * float(fitted), 1.5 * float(fitted)))
     assert float(fitted) > 5.0  # metres
@@ -97,16 +97,16 @@ def test_an_object_of_several_materials_keeps_its_finishes() -> None:
     values = {round(float(one), 3) for one in np.unique(rough)}
     assert values == {round(one.roughness, 3) for one in car.object.finishes.values()}
     with pytest.raises(InputError, match=r"material.roughness: the object has several materials"):
-        describe("car", given={"material.roughness": 0.1})
+        load_description("car", given={"material.roughness": 0.1})
 
 
 def test_only_the_paint_is_painted() -> None:
-    scene = describe("car")
+    scene = load_description("car")
     bound = TextureControl(materials="paint", epsilon=0.3).bind(scene)
     before, after = (bound.inputs(u)["object.base_color"] for u in (bound.start, (bound.start + 0.3).clamp(0.0, 1.0)))
     moved = ((after - before).abs().amax(dim=2) > 0.01).numpy()
     mesh, shape = scene.object.mesh, (moved.shape[0], moved.shape[1])
-    paint, _ = texels_of_faces(mesh, mesh.materials["paint"], shape)
-    glass, _ = texels_of_faces(mesh, mesh.materials["glass"], shape)
+    paint, _ = find_exclusive_texels(mesh, mesh.materials["paint"], shape)
+    glass, _ = find_exclusive_texels(mesh, mesh.materials["glass"], shape)
     assert moved[paint].mean() > 0.99
     assert not moved[glass].any()

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.geometry import FRAME_FILL, camera_to_world, middle, object_to_world, rotation
-from advsearch.scene.settings import SETTINGS, resolve
+from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.geometry import FRAME_FILL, camera_to_world, compute_center, make_rotation, object_to_world
+from advsearch.scene.settings import SETTINGS, resolve_settings
 
 
 def projected(description: SceneDescription) -> np.ndarray:
@@ -25,7 +25,7 @@ def projected(description: SceneDescription) -> np.ndarray:
 @pytest.mark.parametrize("name", ["mug", "bowl", "lamp", "wine-glass"])
 @pytest.mark.parametrize("fov", [20.0, 35.0, 60.0])
 def test_the_default_camera_frames_the_whole_object_and_fills_the_frame(name: str, fov: float) -> None:
-    points = projected(describe(name, given={"camera.fov": fov}))
+    points = projected(load_description(name, given={"camera.fov": fov}))
     assert points[:, 2].min() > 0.0
     assert np.abs(points[:, :2]).max() == pytest.approx(FRAME_FILL, abs=1e-3)
 
@@ -34,58 +34,58 @@ def test_the_default_camera_frames_the_whole_object_and_fills_the_frame(name: st
 @pytest.mark.parametrize("name", ["mug", "banana", "hammer", "chair", "teapot"])
 def test_no_azimuth_takes_any_of_the_object_out_of_the_picture(name: str) -> None:
     reached = [
-        np.abs(projected(describe(name, given={"camera.azimuth": float(azimuth)}))[:, :2]).max()
+        np.abs(projected(load_description(name, given={"camera.azimuth": float(azimuth)}))[:, :2]).max()
         for azimuth in range(0, 360, 5)
     ]
     assert max(reached) <= 1.0 + 1e-6
-    assert max(reached) > 0.98 or np.abs(projected(describe(name))[:, :2]).max() == pytest.approx(FRAME_FILL)
+    assert max(reached) > 0.98 or np.abs(projected(load_description(name))[:, :2]).max() == pytest.approx(FRAME_FILL)
 
 
 @pytest.mark.parametrize("name", ["azimuth", "elevation", "roll"])
 def test_the_distance_does_not_depend_on_where_the_camera_is_moved_to(name: str) -> None:
-    scene = describe("banana")
-    distance = np.linalg.norm(camera_to_world(scene)[:3, 3] - middle(scene))
+    scene = load_description("banana")
+    distance = np.linalg.norm(camera_to_world(scene)[:3, 3] - compute_center(scene))
     moved = camera_to_world(scene.with_values(**{f"camera__{name}": 70.0}))
-    assert np.linalg.norm(moved[:3, 3] - middle(scene)) == pytest.approx(distance, abs=1e-12)
+    assert np.linalg.norm(moved[:3, 3] - compute_center(scene)) == pytest.approx(distance, abs=1e-12)
 
 
 def test_a_very_wide_lens_does_not_enter_the_object() -> None:
-    scene = describe("dumbbell", given={"camera.fov": 170.0})
-    radius = np.linalg.norm(scene.object.mesh.vertices - middle(scene), axis=1).max()
-    assert np.linalg.norm(camera_to_world(scene)[:3, 3] - middle(scene)) >= radius + 0.02 - 1e-9
+    scene = load_description("dumbbell", given={"camera.fov": 170.0})
+    radius = np.linalg.norm(scene.object.mesh.vertices - compute_center(scene), axis=1).max()
+    assert np.linalg.norm(camera_to_world(scene)[:3, 3] - compute_center(scene)) >= radius + 0.02 - 1e-9
 
 
 def test_a_camera_at_azimuth_zero_and_no_elevation_looks_from_plus_x_with_z_up() -> None:
-    camera = camera_to_world(describe("mug", given={"camera.azimuth": 0.0, "camera.elevation": 0.0}))
+    camera = camera_to_world(load_description("mug", given={"camera.azimuth": 0.0, "camera.elevation": 0.0}))
     assert np.allclose(camera[:3, 2], [-1, 0, 0]) and np.allclose(camera[:3, 1], [0, 0, 1])
     assert camera[0, 3] > 0 and np.linalg.det(camera[:3, :3]) == pytest.approx(1.0)
 
 
 def test_a_rolled_camera_turns_the_picture_and_nothing_else() -> None:
-    plain, rolled = (camera_to_world(describe("ball", given={"camera.roll": roll})) for roll in (0.0, 90.0))
+    plain, rolled = (camera_to_world(load_description("ball", given={"camera.roll": roll})) for roll in (0.0, 90.0))
     assert np.allclose(rolled[:3, 2], plain[:3, 2])
     assert np.allclose(np.abs(rolled[:3, 0] @ plain[:3, 1]), 1.0)
 
 
 @pytest.mark.parametrize("pose", [{}, {"pose.pitch": 35.0}, {"pose.roll": 90.0, "pose.scale": 2.0}])
 def test_an_object_stands_on_the_ground_in_every_pose(pose: dict[str, float]) -> None:
-    description = describe("mug", given=pose)
+    description = load_description("mug", given=pose)
     matrix = object_to_world(description)
     heights = description.object.mesh.vertices @ matrix[2, :3] + matrix[2, 3]
     assert heights.min() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_height_above_the_ground_is_added() -> None:
-    matrix = object_to_world(describe("ball", given={"pose.z": 0.25}))
+    matrix = object_to_world(load_description("ball", given={"pose.z": 0.25}))
     assert matrix[2, 3] == pytest.approx(0.25, abs=1e-6)
 
 
 def test_rotations_turn_yaw_counter_clockwise_seen_from_above() -> None:
-    assert np.allclose(rotation(90.0, 0.0, 0.0) @ [1, 0, 0], [0, 1, 0])
+    assert np.allclose(make_rotation(90.0, 0.0, 0.0) @ [1, 0, 0], [0, 1, 0])
 
 
 def test_every_default_lies_in_its_range_and_resolves() -> None:
-    values = resolve({})
+    values = resolve_settings({})
     assert set(values) == set(SETTINGS)
     for name, setting in SETTINGS.items():
         assert isinstance(setting.default, str) or setting.low <= setting.default <= setting.high, name
@@ -95,19 +95,19 @@ def test_a_wrong_setting_is_explained() -> None:
     with pytest.raises(
         UnknownNameError, match=r"unknown scene parameter 'camera.azimut'. Did you mean 'camera.azimuth'"
     ):
-        resolve({"camera.azimut": 1.0})
+        resolve_settings({"camera.azimut": 1.0})
     with pytest.raises(InputError, match=r"`set` camera.fov: expected a number from 1 to 170 \(degrees\), got 200"):
-        resolve({"camera.fov": 200.0})
+        resolve_settings({"camera.fov": 200.0})
     with pytest.raises(InputError, match="got nan"):
-        resolve({"pose.x": float("nan")})
+        resolve_settings({"pose.x": float("nan")})
     with pytest.raises(InputError, match="expected a number in degrees, got 'left'"):
-        resolve({"pose.yaw": "left"})
+        resolve_settings({"pose.yaw": "left"})
 
 
 def test_unknown_names_and_a_needless_up_are_explained() -> None:
     with pytest.raises(UnknownNameError, match=r"unknown object 'mugg'. Did you mean 'mug'"):
-        describe("mugg")
+        load_description("mugg")
     with pytest.raises(UnknownNameError, match=r"unknown environment 'studo'. Did you mean 'studio'"):
-        describe("mug", "studo")
+        load_description("mug", "studo")
     with pytest.raises(InputError, match="up: bundled objects stand upright already"):
-        describe("mug", up="y")
+        load_description("mug", up="y")

@@ -9,10 +9,10 @@ import torch
 
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.description import describe
+from advsearch.scene.description import load_description
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.parts import BallLamp, PlacedCamera, PointLamp
+from advsearch.scene.parts import BallLamp, PointLamp, PosedCamera
 from advsearch.scene.settings import ORBIT_CAMERA
 
 
@@ -26,11 +26,11 @@ def picture(scene: Scene, controls: str | dict[str, dict[str, object]] = "pose")
     "lamp",
     [
         PointLamp("key", position=(1.5, -1.0, 2.5), intensity=(1.0, 1.0, 1.0)),
-        BallLamp("key", place=(1.5, -1.0, 2.5), radius=0.1, radiance=(31.8, 31.8, 31.8)),
+        BallLamp("key", center=(1.5, -1.0, 2.5), radius=0.1, radiance=(31.8, 31.8, 31.8)),
     ],
 )
 def test_a_scene_without_a_map_is_lit_and_metered_by_its_lamps(lamp: PointLamp | BallLamp) -> None:
-    scene = describe("mug", "none").with_part(lamp)
+    scene = load_description("mug", "none").with_part(lamp)
     assert scene.environment is None and set(scene.lamps) == {"key"} and set(scene.meshes) == {"object"}
     assert Scene(scene).description.gain == pytest.approx(61.2, rel=0.01)
     seen = picture(Scene(scene))
@@ -57,24 +57,24 @@ def test_what_needs_a_map_says_so(control: str, message: str) -> None:
 
 
 def test_meshes_have_names_and_one_of_them_is_the_object() -> None:
-    scene = describe("mug")
+    scene = load_description("mug")
     scene = scene.with_part(replace(scene.meshes["object"], name="second"))
     assert list(scene.meshes) == ["object", "second"] and scene.meshes["object"].mesh is scene.object.mesh
-    assert {"object.vertices", "second.vertices"} <= MitsubaScene(scene, (8, 8)).names
+    assert {"object.vertices", "second.vertices"} <= MitsubaScene(scene, (8, 8)).input_names
     with pytest.raises(InputError, match="the scene has something of that name already"):
         scene.with_part(scene.meshes["object"])
 
 
 @pytest.mark.medium
 def test_a_scene_is_seen_by_any_of_its_cameras() -> None:
-    scene = describe("mug")
-    side = describe("mug", given={"camera.azimuth": 130.0, "camera.fov": 50.0})
-    cameras = {"front": PlacedCamera(camera_to_world(scene), 35.0), "side": PlacedCamera(camera_to_world(side), 50.0)}
+    scene = load_description("mug")
+    side = load_description("mug", given={"camera.azimuth": 130.0, "camera.fov": 50.0})
+    cameras = {"front": PosedCamera(camera_to_world(scene), 35.0), "side": PosedCamera(camera_to_world(side), 50.0)}
     scene = replace(scene, cameras=cameras)
-    assert torch.equal(picture(Scene(scene.seen_by("front"))), picture(Scene(scene)))
-    assert torch.equal(picture(Scene(scene.seen_by("side"))), picture(Scene(side)))
-    assert scene.seen_by("side").seen_by(ORBIT_CAMERA).number("camera.fov") == 35.0
+    assert torch.equal(picture(Scene(scene.with_camera("front"))), picture(Scene(scene)))
+    assert torch.equal(picture(Scene(scene.with_camera("side"))), picture(Scene(side)))
+    assert scene.with_camera("side").with_camera(ORBIT_CAMERA).number("camera.fov") == 35.0
     with pytest.raises(UnknownNameError, match=r"unknown camera 'sied'. Did you mean 'side'"):
-        scene.seen_by("sied")
+        scene.with_camera("sied")
     with pytest.raises(InputError, match=r"moves along an orbit .* seen by its camera 'side'; leave the control out"):
-        picture(Scene(scene.seen_by("side")), "camera")
+        picture(Scene(scene.with_camera("side")), "camera")

@@ -18,11 +18,11 @@ from trimesh.visual.material import PBRMaterial
 import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.scene.description import describe
+from advsearch.scene.description import load_description
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.importing.scenes import LUMENS, split_node
-from advsearch.scene.mitsuba_backend.parts import translation
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.parts import translate_part
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene
 from advsearch.scene.mitsuba_backend.xml_files import read_scene
 from advsearch.scene.parts import PointLamp, SpotLamp
@@ -78,7 +78,7 @@ def file(data: bytes, tmp_path: Path) -> Path:
 
 
 def test_a_node_is_the_object_and_the_rest_stays_in_its_place_around_it(file: Path) -> None:
-    scene = describe(f"{file}#crate")
+    scene = load_description(f"{file}#crate")
     assert set(scene.meshes) == {"object", "floor", "the-wall"}
     assert np.ptp(scene.base_vertices, axis=0) == pytest.approx([1.0, 1.0, 1.0])
     wall = scene.meshes["the-wall"]
@@ -90,22 +90,22 @@ def test_a_node_is_the_object_and_the_rest_stays_in_its_place_around_it(file: Pa
 
 
 def test_a_lamp_lights_as_in_the_file_and_takes_the_place_of_a_map(file: Path) -> None:
-    scene = describe(f"{file}#crate")
+    scene = load_description(f"{file}#crate")
     assert scene.environment is None
     lamp = scene.lamps["bulb"]
     assert isinstance(lamp, PointLamp)
     assert lamp.position == pytest.approx((0.0, -0.5, 2.5))
-    _, here = lamp.lighting(np.array([0.0, -0.5, 0.0]))
+    _, here = lamp.compute_lighting(np.array([0.0, -0.5, 0.0]))
     candela = np.array([1.0, 0.5, 0.0]) * 683.0
     assert here == pytest.approx(candela / LUMENS / 5.0**2)  # five metres below it
-    assert describe(f"{file}#crate", "kitchen").environment_name == "kitchen"
+    assert load_description(f"{file}#crate", "kitchen").environment_name == "kitchen"
 
 
 def test_a_camera_of_the_file_sees_the_object_where_it_is(file: Path) -> None:
-    scene = describe(f"{file}#crate")
+    scene = load_description(f"{file}#crate")
     camera = scene.cameras["front"]
     assert camera.fov == pytest.approx(math.degrees(2 * math.atan(2 * math.tan(0.4))))
-    pose = camera_to_world(scene.seen_by("front"))
+    pose = camera_to_world(scene.with_camera("front"))
     seen = np.linalg.inv(pose) @ np.array([0.0, 0.0, 0.5, 1.0])
     assert seen[:3] == pytest.approx([0.0, 0.0, 4.0], abs=1e-6)  # eight metres ahead, in the middle
     right = np.linalg.inv(pose) @ np.array([0.0, 0.5, 0.5, 1.0])
@@ -123,14 +123,14 @@ def test_an_object_brings_what_hangs_on_it(data: bytes, tmp_path: Path) -> None:
 
     file = tmp_path / "room.glb"
     file.write_bytes(with_header(data, under))
-    scene = describe(f"{file}#crate")
+    scene = load_description(f"{file}#crate")
     assert set(scene.meshes) == {"object", "floor"}
     assert float(np.ptp(scene.base_vertices, axis=0).max()) == pytest.approx(1.0)
 
 
 def test_names_say_which_node(file: Path, data: bytes) -> None:
     with pytest.raises(UnknownNameError, match=r"unknown node of room.glb 'crates'. Did you mean 'crate'"):
-        describe(f"{file}#crates")
+        load_description(f"{file}#crates")
 
     def twins(header: dict[str, Any]) -> None:
         for node in header["nodes"]:
@@ -141,14 +141,14 @@ def test_names_say_which_node(file: Path, data: bytes) -> None:
     with pytest.raises(
         InputError, match=r"2 nodes are called .*crate.*; say which: room.glb#node \d, room.glb#node \d"
     ):
-        describe(f"{file}#crate")
+        load_description(f"{file}#crate")
     number = next(int(word) for word in "0 1 2 3 4".split() if _is_crate(f"{file}#node {word}"))
-    assert describe(f"{file}#node {number}").object_name == f"{file}#node {number}"
+    assert load_description(f"{file}#node {number}").object_name == f"{file}#node {number}"
 
 
 def _is_crate(spec: str) -> bool:
     try:
-        return "crate-2" in describe(spec).meshes or "crate" in describe(spec).meshes
+        return "crate-2" in load_description(spec).meshes or "crate" in load_description(spec).meshes
     except UnknownNameError:
         return False
 
@@ -163,7 +163,7 @@ def test_what_is_not_carried_over_is_named(file: Path, data: bytes) -> None:
         header["cameras"].append({"type": "orthographic"})
 
     file.write_bytes(with_header(data, more))
-    notes = " ".join(describe(f"{file}#crate").notes)
+    notes = " ".join(load_description(f"{file}#crate").notes)
     for words in (
         "1 emission texture with other coordinates than the base colour: left out, with the emission",
         "room.glb: 1 directional light, here as lamps 1000 object sizes away",
@@ -186,7 +186,7 @@ DOWN = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 def test_a_spot_shines_in_its_cone(file: Path, data: bytes) -> None:
     cone = {"innerConeAngle": math.radians(10.0), "outerConeAngle": math.radians(30.0)}
     file.write_bytes(with_header(data, lambda header: shone(header, cone, DOWN)))
-    scene = describe(f"{file}#crate")
+    scene = load_description(f"{file}#crate")
     assert scene.environment is None and not any("spot" in note for note in scene.notes)
     lamp = scene.lamps["bulb"]
     assert isinstance(lamp, SpotLamp)
@@ -195,20 +195,20 @@ def test_a_spot_shines_in_its_cone(file: Path, data: bytes) -> None:
     candela = np.array([1.0, 0.5, 0.0]) * 683.0
     for angle, share in ((0.0, 1.0), (9.0, 1.0), (20.0, 0.5), (31.0, 0.0)):
         out = 2.5 * math.tan(math.radians(angle))
-        _, here = lamp.lighting(np.array([0.0, out - 0.5, 0.0]))
+        _, here = lamp.compute_lighting(np.array([0.0, out - 0.5, 0.0]))
         metres = 5.0 / math.cos(math.radians(angle))
         assert here == pytest.approx(share * candela / LUMENS / metres**2 * 4.0 / 2.0**2, abs=1e-9)
 
 
 def test_a_spot_lights_in_mitsuba_as_it_is_metered() -> None:
     lamp = SpotLamp("lamp", position=(0.0, 0.0, 2.0), direction=(0.6, 0.0, -0.8), intensity=(3.0, 2.0, 1.0), beam=10.0)
-    mi = mitsuba()
+    mi = import_mitsuba()
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(10)}
-    scene = mi.load_dict({"type": "scene", "floor": floor, **translation(lamp).plugins})
+    scene = mi.load_dict({"type": "scene", "floor": floor, **translate_part(lamp).plugins})
     for x in (-1.0, 0.0, 0.5, 1.5, 3.0, 5.0):
         seen = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.3, 1.0), mi.Vector3f(0.0, 0.0, -1.0)))
         _, weight = scene.sample_emitter_direction(seen, mi.Point2f(0.5, 0.5))
-        assert np.array(weight).ravel() == pytest.approx(lamp.lighting(np.array([x, 0.3, 0.0]))[1], rel=1e-4)
+        assert np.array(weight).ravel() == pytest.approx(lamp.compute_lighting(np.array([x, 0.3, 0.0]))[1], rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -230,7 +230,7 @@ def test_a_spot_of_any_cone_is_rendered(cone: dict[str, float], file: Path, data
 def test_a_spot_whose_cone_is_none_is_refused(cone: dict[str, float], file: Path, data: bytes) -> None:
     file.write_bytes(with_header(data, lambda header: shone(header, cone, DOWN)))
     with pytest.raises(FileFormatError, match=r"expected glTF whose .*ConeAngle is (greater|less) than"):
-        describe(f"{file}#crate")
+        load_description(f"{file}#crate")
 
 
 @pytest.mark.parametrize("spec", ["room.obj#crate", "crate#a.png", "room.glb"])
@@ -243,7 +243,7 @@ def test_wrong_numbers_of_lights_and_cameras_are_damage(file: Path, data: bytes)
     for entry in ({"camera": 7}, {"extensions": {"KHR_lights_punctual": {"light": 3}}}):
         file.write_bytes(with_header(data, lambda header, entry=entry: add(header, entry)))
         with pytest.raises(FileFormatError, match=r"expected glTF with \d (cameras|lights), as it refers to"):
-            describe(f"{file}#crate")
+            load_description(f"{file}#crate")
 
 
 @pytest.mark.medium
@@ -320,7 +320,7 @@ def test_a_light_or_camera_out_of_reach_is_refused(
 ) -> None:
     file.write_bytes(with_header(data, lambda header: header["nodes"][node].update(change)))
     with pytest.raises(InputError, match=re.escape(words)):
-        describe(f"{file}#crate")
+        load_description(f"{file}#crate")
 
 
 def test_a_light_that_is_too_bright_or_takes_light_away_is_refused(file: Path, data: bytes) -> None:
@@ -330,17 +330,17 @@ def test_a_light_that_is_too_bright_or_takes_light_away_is_refused(file: Path, d
     for kind in ("point", "directional"):
         file.write_bytes(with_header(data, lambda header, kind=kind: lit(header, type=kind, intensity=1e306)))
         with pytest.raises(InputError, match=r"expected the light bulb within .* and no brighter than that, got more"):
-            describe(f"{file}#crate")
+            load_description(f"{file}#crate")
     file.write_bytes(with_header(data, lambda header: lit(header, color=[1.0, -1.0, 0.0])))
     with pytest.raises(FileFormatError, match=r"color\[1\] is greater than or equal to 0"):
-        describe(f"{file}#crate")
+        load_description(f"{file}#crate")
 
 
 @pytest.mark.parametrize("angle", [3.1, 3.1415])
 def test_a_camera_that_sees_all_is_refused(angle: float, file: Path, data: bytes) -> None:
     file.write_bytes(with_header(data, lambda header: header["cameras"][0]["perspective"].update(yfov=angle)))
     with pytest.raises(InputError, match="expected the camera front with a field of view up to 170 degrees, got 1"):
-        describe(f"{file}#crate")
+        load_description(f"{file}#crate")
 
 
 def test_a_scene_without_an_object_is_answered_with_what_is_in_it(

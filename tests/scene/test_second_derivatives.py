@@ -18,12 +18,12 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls.geometry import _Solve
-from advsearch.models.model import recomputed
-from advsearch.scene.color import LOW_END, linear_to_srgb
+from advsearch.models.model import compute_checkpointed
+from advsearch.scene.color import LINEAR_LIMIT, linear_to_srgb
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_backend.transport import Vertices
-from advsearch.scene.surface.arrangement import product
-from advsearch.scene.transport.matrix import COARSE, TextureTransport
+from advsearch.scene.surface.arrangement import multiply_sparse
+from advsearch.scene.transport.matrix import CELL_SIZE, TextureTransport
 
 ONCE = {"_Radiance", "_Differences", "_OnceDifferentiable"}
 """They refuse a second derivative (`tests/scene/test_renderer.py`)."""
@@ -39,17 +39,17 @@ def solved() -> Callable[[Tensor], Tensor]:
 
 def sparse() -> Callable[[Tensor], Tensor]:
     matrix = scipy.sparse.random(7, 5, 0.5, "csr", random_state=0)
-    return lambda x: product(matrix, x.reshape(5, 2))
+    return lambda x: multiply_sparse(matrix, x.reshape(5, 2))
 
 
 def transport() -> Callable[[Tensor], Tensor]:
     """Of two texels, beside each other, four pixels see some."""
-    made, shape = TextureTransport((2, 2), (COARSE, COARSE)), (COARSE, COARSE, 3)
+    made, shape = TextureTransport((2, 2), (CELL_SIZE, CELL_SIZE)), (CELL_SIZE, CELL_SIZE, 3)
     places = torch.tensor([[0.1, 0.3], [0.2, 0.3], [0.3, 0.3], [0.3, 0.4]])
     weight = torch.arange(1.0, 13.0).reshape(4, 3) / 6.0
-    made.add([Vertices(torch.arange(4), places, weight, torch.tensor([True, True, False, True]))], share=1.0)
+    made.add_pass([Vertices(torch.arange(4), places, weight, torch.tensor([True, True, False, True]))], fraction=1.0)
     made.finish()
-    spread = torch.randn(10, *shape, generator=torch.Generator().manual_seed(1)) / COARSE
+    spread = torch.randn(10, *shape, generator=torch.Generator().manual_seed(1)) / CELL_SIZE
     return lambda x: made(torch.einsum("n,nhwc->hwc", x.float(), spread)).double()
 
 
@@ -99,7 +99,7 @@ def test_a_shown_picture_is_the_encoded_one() -> None:
     """Picture and derivative bit for bit, below black, above white and at the bend too; and a second derivative."""
     formation, generator = ImageFormation(gain=1.37), torch.Generator().manual_seed(0)
     radiance = torch.rand(8, 8, 3, generator=generator) - 0.1
-    radiance[0, :5, 0] = torch.tensor([0.0, 1.0 / 1.37, LOW_END / 1.37, math.inf, -1.0])
+    radiance[0, :5, 0] = torch.tensor([0.0, 1.0 / 1.37, LINEAR_LIMIT / 1.37, math.inf, -1.0])
     cotangent, found = torch.randn(8, 8, 3, generator=generator), []
     for shown in (formation.display, lambda one: linear_to_srgb(one * 1.37)):
         at = radiance.clone().requires_grad_()
@@ -117,5 +117,5 @@ def test_what_is_computed_again_is_differentiated_as_it_is() -> None:
 
     x = torch.linspace(-1.0, 1.0, 6, dtype=torch.float64).reshape(2, 3).requires_grad_()
     for name in ("one", "sum"):
-        assert torch.autograd.gradcheck(lambda at, name=name: recomputed(network, at.sin())[name], x)
-        assert torch.autograd.gradgradcheck(lambda at, name=name: recomputed(network, at.sin())[name], x)
+        assert torch.autograd.gradcheck(lambda at, name=name: compute_checkpointed(network, at.sin())[name], x)
+        assert torch.autograd.gradgradcheck(lambda at, name=name: compute_checkpointed(network, at.sin())[name], x)

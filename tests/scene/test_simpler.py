@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from advsearch.scene.assets import Mesh, simpler
+from advsearch.scene.assets import Mesh, make_simplifier
 from advsearch.scene.library import load_object
 
 
@@ -23,13 +23,13 @@ def ball(rows: int = 90, columns: int = 180) -> Mesh:
 
 
 def test_few_faces_are_left_alone() -> None:
-    assert simpler(load_object("mug").mesh, 6000) is None
+    assert make_simplifier(load_object("mug").mesh, 6000) is None
 
 
 @pytest.mark.parametrize("most", [20_000, 5_000, 1_500])
 def test_a_ball_of_fewer_faces_is_still_a_closed_ball(most: int) -> None:
     own = ball()
-    found = simpler(own, most)
+    found = make_simplifier(own, most)
     assert found is not None
     less = found(own)
     assert most / 4 < len(less.faces) <= most
@@ -46,7 +46,7 @@ def test_a_ball_of_fewer_faces_is_still_a_closed_ball(most: int) -> None:
 
 def test_a_seam_stays_shut() -> None:
     own = ball()
-    found = simpler(own, 5_000)
+    found = make_simplifier(own, 5_000)
     assert found is not None
     _, together = np.unique(found(own).vertices, axis=0, return_inverse=True)
     edges = together.reshape(-1)[found(own).faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)]

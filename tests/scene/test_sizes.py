@@ -12,14 +12,14 @@ import torch
 
 from advsearch.controls.camera import CameraControl
 from advsearch.controls.path import PathControl
-from advsearch.engine.loading import load_scene, scene_as_settings
+from advsearch.engine.loading import load_scene, scene_to_settings
 from advsearch.errors import InputError
 from advsearch.scene import library
-from advsearch.scene.assembly import posed
-from advsearch.scene.assets import on_roads
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.assembly import pose_mesh
+from advsearch.scene.assets import is_road_vehicle
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.glb import glb
+from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import import_scene
 
@@ -36,10 +36,10 @@ def box(folder: Path, name: str, longest: float) -> Path:
 
 
 def glb_of(folder: Path, name: str, longest: float) -> Path:
-    part = describe(str(box(folder, name, 1.0)), up="z").meshes["object"]
-    found = posed(part, {})
+    part = load_description(str(box(folder, name, 1.0)), up="z").meshes["object"]
+    found = pose_mesh(part, {})
     path = folder / f"{name}.glb"
-    path.write_bytes(glb([replace(found, mesh=replace(found.mesh, vertices=found.mesh.vertices * longest))]))
+    path.write_bytes(encode_glb([replace(found, mesh=replace(found.mesh, vertices=found.mesh.vertices * longest))]))
     return path
 
 
@@ -64,21 +64,21 @@ def test_a_car_stands_in_its_lane_at_its_size(tmp_path: Path, longest: float, sa
     scene = load_scene(str(box(tmp_path, "sedan", longest)), "street", up="z", **said)  # type: ignore[arg-type]
     own = scene.description
     assert own.metres == pytest.approx(4.9, rel=1e-5)
-    road = own.around["road"].mesh.vertices
+    road = own.surrounding_meshes["road"].mesh.vertices
     assert np.ptp(road[:, 0]) * own.metres == pytest.approx(120.0)
     assert np.ptp(own.base_vertices, axis=0) / np.ptp(road, axis=0)[0] * 120.0 == pytest.approx(
         [4.9, 1.96, 1.47], rel=1e-4
     )
     assert [note.split(" to face")[0] for note in own.notes] == ["sedan.obj: its front is taken"]
-    assert {name: scene_as_settings(scene)[name] for name in said} == said
+    assert {name: scene_to_settings(scene)[name] for name in said} == said
 
 
 def test_what_is_said_of_a_size_wins_over_what_a_file_says(tmp_path: Path) -> None:
     path = str(glb_of(tmp_path, "car", 4.9))
-    assert describe(path, unit="cm").metres == pytest.approx(0.049, rel=1e-5)
-    assert describe(path, size=4.1).metres == 4.1
-    assert describe("mug", size=0.1).metres == 0.1
-    assert describe("mug").metres == pytest.approx(0.11, abs=0.001)
+    assert load_description(path, unit="cm").metres == pytest.approx(0.049, rel=1e-5)
+    assert load_description(path, size=4.1).metres == 4.1
+    assert load_description("mug", size=0.1).metres == 0.1
+    assert load_description("mug").metres == pytest.approx(0.11, abs=0.001)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_what_is_said_of_a_size_wins_over_what_a_file_says(tmp_path: Path) -> No
 def test_a_size_that_is_unlike_its_name_is_asked_for(
     tmp_path: Path, name: str, environment: str, said: dict[str, object], words: str
 ) -> None:
-    notes = " ".join(describe(str(box(tmp_path, name, 490.0)), environment, up="z", **said).notes)  # type: ignore[arg-type]
+    notes = " ".join(load_description(str(box(tmp_path, name, 490.0)), environment, up="z", **said).notes)  # type: ignore[arg-type]
     if words:
         with pytest.raises(AssertionError, match=words):
             raise AssertionError(notes)
@@ -112,20 +112,20 @@ def test_what_cannot_be_a_size_is_refused(tmp_path: Path) -> None:
         ({"size": float("nan")}, "expected a longest side of"),
     ):
         with pytest.raises(InputError, match=words):
-            describe(path, **said)
+            load_description(path, **said)
     with pytest.raises(InputError, match="mug is no mesh file"):
-        describe("mug", unit="cm")
-    huge = describe(str(glb_of(tmp_path, "planet", 1e6)))
+        load_description("mug", unit="cm")
+    huge = load_description(str(glb_of(tmp_path, "planet", 1e6)))
     assert huge.object.metres is None  # nothing that has a size in metres
 
 
 def test_a_node_has_the_size_that_it_has_in_its_scene(tmp_path: Path) -> None:
-    part = posed(describe(str(box(tmp_path, "seat", 1.0)), up="z").meshes["object"], {})
+    part = pose_mesh(load_description(str(box(tmp_path, "seat", 1.0)), up="z").meshes["object"], {})
     both = [
         replace(part, name="seat"),
         replace(part, name="far", mesh=replace(part.mesh, vertices=part.mesh.vertices + 3)),
     ]
-    (tmp_path / "room.glb").write_bytes(glb(both))
+    (tmp_path / "room.glb").write_bytes(encode_glb(both))
     assert import_scene(tmp_path / "room.glb", "seat").object.metres == pytest.approx(1.0, rel=1e-5)
     assert import_object(tmp_path / "room.glb").metres == pytest.approx(4.0, rel=1e-5)
 
@@ -137,7 +137,7 @@ def away(scene: SceneDescription) -> float:
 def test_a_path_of_a_file_is_in_metres(tmp_path: Path) -> None:
     way = tmp_path / "way.csv"
     way.write_text("time,x,y,z,look_x,look_y,look_z\n0,20,0,1,0,0,1\n2,10,0,1,0,0,1\n")
-    scene = describe(str(box(tmp_path, "sedan", 1.0)), "street", up="z", size=5.0)
+    scene = load_description(str(box(tmp_path, "sedan", 1.0)), "street", up="z", size=5.0)
     path = PathControl(path=str(way)).bind(scene)
     place = path.inputs(torch.tensor([0.0]))["camera.to_world"][:3, 3].double().numpy()
     middle = (scene.base_vertices.min(axis=0) + scene.base_vertices.max(axis=0)) / 2.0
@@ -154,7 +154,7 @@ def test_the_floor_of_a_photograph_is_seen_from_a_tripod(tmp_path: Path) -> None
         ({}, {}, 3.0),
         ({}, {"ground.height": 2.0}, 2.0),
     ):
-        assert describe(path, given=given, up="z", **said).capture_height == pytest.approx(height)  # type: ignore[arg-type]
+        assert load_description(path, given=given, up="z", **said).capture_height == pytest.approx(height)  # type: ignore[arg-type]
 
 
 SIZES = {
@@ -168,14 +168,14 @@ SIZES = {
 @pytest.mark.medium
 def test_bundled_objects_have_their_true_size() -> None:
     assert {name: library.load_object(name).metres for name in library.list_objects()} == pytest.approx(SIZES, abs=6e-3)
-    assert not any(describe(name).notes for name in SIZES)
+    assert not any(load_description(name).notes for name in SIZES)
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize("name", sorted(SIZES))
 def test_a_size_in_metres_changes_no_picture(name: str) -> None:
     """Neither where the camera stands by itself nor where it is searched; and a distance in sizes is that in metres."""
-    sized = describe(name)
+    sized = load_description(name)
     bare = replace(sized, object=replace(sized.object, metres=None))
     assert np.array_equal(camera_to_world(sized), camera_to_world(bare))
     around: dict[str, Any] = {"azimuth": [0, 90], "elevation": [5, 60]}
@@ -184,7 +184,7 @@ def test_a_size_in_metres_changes_no_picture(name: str) -> None:
         ({**around, "distance": [1.5 * sized.metres, 6.0 * sized.metres]}, far),
         ({**around, "sizes": [1.5, 6]}, far),
     ]
-    if not on_roads(sized.object):  # these are looked at from some height in metres
+    if not is_road_vehicle(sized.object):  # these are looked at from some height in metres
         pairs.append(({}, {}))
     for asked, same in pairs:
         controls = CameraControl(**asked).bind(sized), CameraControl(**same).bind(bare)

@@ -8,7 +8,7 @@ import pytest
 from advsearch.scene import library
 from advsearch.scene import surface_parts as parts_of
 from advsearch.scene.assets import Mesh
-from advsearch.scene.surface_parts import CELLS, SurfaceParts
+from advsearch.scene.surface_parts import MAP_SIZE, SurfaceParts
 
 
 def board(front: tuple[float, float], back: tuple[float, float], flat: bool = False) -> Mesh:
@@ -25,15 +25,20 @@ def board(front: tuple[float, float], back: tuple[float, float], flat: bool = Fa
 
 def test_cells_run_from_the_top_row_and_have_places_on_the_mesh() -> None:
     parts = SurfaceParts(board((0.0, 0.5), (0.5, 1.0)))
-    assert not parts.unwrapped and parts.count == CELLS**2 + 4
+    assert not parts.is_unwrapped and parts.count == MAP_SIZE**2 + 4
     uv = np.array([(0.0, 1.0), (0.499, 1.0), (1.0, 0.0), (0.25, 0.5)])
-    found = parts.cells(np.array([1, 1, 3, 0]), uv)
-    half = CELLS // 2
-    assert found.tolist() == [0, half - 1, CELLS**2 - 1, half * CELLS + half // 2]
-    assert parts.place[found[:3]] == pytest.approx(np.array([(0, 0, 1), (1, 0, 1), (1, 0.1, 0)]), abs=2.0 / CELLS)
+    found = parts.find_cells(np.array([1, 1, 3, 0]), uv)
+    half = MAP_SIZE // 2
+    assert found.tolist() == [0, half - 1, MAP_SIZE**2 - 1, half * MAP_SIZE + half // 2]
+    assert parts.centers[found[:3]] == pytest.approx(np.array([(0, 0, 1), (1, 0, 1), (1, 0.1, 0)]), abs=2.0 / MAP_SIZE)
     assert parts.face[found].tolist() == [1, 1, 2, 0]
-    assert parts.at[0] == pytest.approx((0.5 / CELLS, 1 - 0.5 / CELLS)) and parts.covered.all()
-    assert parts.kinds["face"] == slice(CELLS**2, CELLS**2 + 4) and parts.face[CELLS**2 :].tolist() == [0, 1, 2, 3]
+    assert parts.center_uvs[0] == pytest.approx((0.5 / MAP_SIZE, 1 - 0.5 / MAP_SIZE)) and parts.is_covered.all()
+    assert parts.part_slices["face"] == slice(MAP_SIZE**2, MAP_SIZE**2 + 4) and parts.face[MAP_SIZE**2 :].tolist() == [
+        0,
+        1,
+        2,
+        3,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -43,26 +48,26 @@ def test_cells_run_from_the_top_row_and_have_places_on_the_mesh() -> None:
 )
 def test_places_that_texture_coordinates_do_not_tell_apart_get_new_ones(mesh: Mesh) -> None:
     parts = SurfaceParts(mesh)
-    assert parts.unwrapped and parts.corners.min() >= 0.0 and parts.corners.max() <= 1.0
+    assert parts.is_unwrapped and parts.corners.min() >= 0.0 and parts.corners.max() <= 1.0
     same = mesh.uvs[mesh.faces[[0, 2]]].mean(axis=1)
-    front, back = parts.cells(np.array([0, 2]), same.astype(np.float64))
-    assert front != back and parts.covered.mean() > 0.2
-    assert parts.place[front][1] < 0.05 < parts.place[back][1]
+    front, back = parts.find_cells(np.array([0, 2]), same.astype(np.float64))
+    assert front != back and parts.is_covered.mean() > 0.2
+    assert parts.centers[front][1] < 0.05 < parts.centers[back][1]
 
 
 def test_a_place_keeps_its_neighbourhood_on_a_new_map() -> None:
     own = library.load_object("mug").mesh
     folded = Mesh(own.vertices, own.faces, own.normals, np.abs(own.uvs - (0.5, 0.0)).astype(np.float32))
     parts, plain = SurfaceParts(folded), SurfaceParts(own)
-    assert parts.unwrapped and not plain.unwrapped
+    assert parts.is_unwrapped and not plain.is_unwrapped
     faces = np.arange(len(own.faces))
     for made in (parts, plain):
-        cells = made.cells(faces, made.mesh.uvs[own.faces].mean(axis=1).astype(np.float64))
-        away = np.linalg.norm(made.place[cells] - made.place[CELLS**2 :], axis=1)
+        cells = made.find_cells(faces, made.mesh.uvs[own.faces].mean(axis=1).astype(np.float64))
+        away = np.linalg.norm(made.centers[cells] - made.centers[MAP_SIZE**2 :], axis=1)
         assert np.median(away) < 0.05 * np.ptp(own.vertices) and (away < 0.15 * np.ptp(own.vertices)).mean() > 0.97
 
 
 def test_faces_of_a_very_large_mesh_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts_of, "MOST_FACES", 3)
+    monkeypatch.setattr(parts_of, "MAX_FACES", 3)
     parts = SurfaceParts(board((0.0, 0.5), (0.5, 1.0)))
-    assert parts.count == CELLS**2 and list(parts.kinds) == ["cell"] and len(parts.place) == CELLS**2
+    assert parts.count == MAP_SIZE**2 and list(parts.part_slices) == ["cell"] and len(parts.centers) == MAP_SIZE**2

@@ -12,7 +12,7 @@ import torch
 from advsearch.engine.loading import load_scene
 from advsearch.errors import UnknownNameError
 from advsearch.runs.files import write_layers
-from advsearch.scene.formation import AOVS, CHANNELS, Surfaces, aovs_of
+from advsearch.scene.formation import AOVS, CHANNELS, Surfaces, parse_aovs
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 
 SIZE = 32
@@ -39,7 +39,7 @@ def made() -> Surfaces:
 
 def test_layers_are_read_back_with_what_they_mean(tmp_path: Path) -> None:
     surfaces, every = made(), tuple(AOVS)
-    path = write_layers(tmp_path / "a.exr", surfaces.layers(every, "object"), surfaces.notes(every))
+    path = write_layers(tmp_path / "a.exr", surfaces.make_layers(every, "object"), surfaces.describe_layers(every))
     with OpenEXR.File(str(path), separate_channels=True) as file:
         found, header = {name: one.pixels for name, one in file.channels().items()}, dict(file.header())
     assert sorted(found) == sorted(f"{name}.{channel}" for name in every for channel in CHANNELS[name])
@@ -53,12 +53,12 @@ def test_layers_are_read_back_with_what_they_mean(tmp_path: Path) -> None:
 def test_depth_normal_and_texture_coordinates_are_those_of_the_triangle(seen: tuple[MitsubaScene, Surfaces]) -> None:
     scene, found = seen
     mesh = scene.assembly.meshes["object"]
-    metres = scene.made[0].metres
-    vertices, faces = metres * mesh.place(None, None)[0], torch.from_numpy(mesh._mesh.faces.astype(np.int64))
+    metres = scene.definition[0].metres
+    vertices, faces = metres * mesh.transform_mesh(None, None)[0], torch.from_numpy(mesh._mesh.faces.astype(np.int64))
     uvs = torch.from_numpy(mesh._mesh.uvs)
-    there = found.seen("object")
+    there = found.visible_mask("object")
     assert int(there.sum()) > SIZE
-    eye = metres * scene.base("camera.to_world")[:3, 3]
+    eye = metres * scene.get_base_value("camera.to_world")[:3, 3]
     corners = faces[found.face[there]]
     for low, high, value in (
         (
@@ -70,7 +70,7 @@ def test_depth_normal_and_texture_coordinates_are_those_of_the_triangle(seen: tu
     ):
         at = getattr(found, value)[there]
         assert bool(((at >= low - 1e-4) & (at <= high + 1e-4)).all()), value
-    ahead = scene.base("camera.to_world")[:3, 2]
+    ahead = scene.get_base_value("camera.to_world")[:3, 2]
     along = (vertices[corners] - eye) @ (ahead / ahead.norm())
     assert bool(((found.z_depth[there] >= along.amin(1) - 1e-4) & (found.z_depth[there] <= along.amax(1) + 1e-4)).all())
     assert bool((found.z_depth[there] < found.depth[there]).all()) and bool(found.z_depth[found.id == 0].isinf().all())
@@ -81,6 +81,6 @@ def test_depth_normal_and_texture_coordinates_are_those_of_the_triangle(seen: tu
 
 
 def test_layers_are_named_in_a_list() -> None:
-    assert aovs_of(None) == () and aovs_of("depth, mask,depth") == ("depth", "mask")
+    assert parse_aovs(None) == () and parse_aovs("depth, mask,depth") == ("depth", "mask")
     with pytest.raises(UnknownNameError, match=r"unknown aov 'deep'"):
-        aovs_of("deep")
+        parse_aovs("deep")

@@ -17,13 +17,13 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.controls import make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.options import things_as_text
+from advsearch.options import format_things
 from advsearch.scene import library
-from advsearch.scene.description import describe
-from advsearch.scene.geometry import blocked, footprint, overlapping, standing
-from advsearch.scene.outlines import seen_things
-from advsearch.scene.surface.renderer import why_not
-from advsearch.scene.things import AskedThing, asked_things
+from advsearch.scene.description import load_description
+from advsearch.scene.geometry import compute_base_vertices, compute_footprint, find_overlap_interval, is_overlapping
+from advsearch.scene.outlines import find_visible_meshes
+from advsearch.scene.surface.renderer import find_refusal
+from advsearch.scene.things import RequestedThing, parse_things
 from advsearch.scene.transport.matrix import LinearRenderer
 
 pytestmark = pytest.mark.usefixtures("two_threads")
@@ -36,15 +36,15 @@ SIDE = 200
 def test_text_list_and_mapping_say_the_same() -> None:
     text = "car@12,3.5,heading=180; chair@6,-2,size=0.9"
     listed = [{"object": "car", "x": 12, "y": 3.5, "heading": 180}, "chair@6,-2,size=0.9"]
-    assert things_as_text(text) == things_as_text(listed) == text
-    assert things_as_text(None) is None and things_as_text(" ; ") is None
-    assert asked_things(text) == (
-        AskedThing("car", 12.0, 3.5, 180.0, None, "car"), AskedThing("chair", 6.0, -2.0, 0.0, 0.9, "chair")
+    assert format_things(text) == format_things(listed) == text
+    assert format_things(None) is None and format_things(" ; ") is None
+    assert parse_things(text) == (
+        RequestedThing("car", 12.0, 3.5, 180.0, None, "car"), RequestedThing("chair", 6.0, -2.0, 0.0, 0.9, "chair")
     )  # fmt: skip
 
 
 def test_every_thing_has_a_name_of_its_own() -> None:
-    found = asked_things("car@5,0; car@10,0; car@15,0; object.glb@1,1,size=1; car@9,9,name=taxi,label=cab")
+    found = parse_things("car@5,0; car@10,0; car@15,0; object.glb@1,1,size=1; car@9,9,name=taxi,label=cab")
     assert [one.name for one in found] == ["car", "car-2", "car-3", "object-2", "taxi"]
     assert found[-1].label == "cab"
 
@@ -70,10 +70,10 @@ def test_what_cannot_be_is_refused(text: str, error: type[InputError], said: str
 def test_an_object_without_metres_has_nothing_beside_it_and_stands_beside_none(tmp_path: Path) -> None:
     loose = replace(library.load_object("mug"), metres=None)
     with pytest.raises(InputError, match="whose size in metres is not known"):
-        describe(loose, things="car@1,2")
+        load_description(loose, things="car@1,2")
     (tmp_path / "thing.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
     with pytest.raises(InputError, match=r"the size of .*thing.obj in metres is not known; say it: .*@4,2,size=METRES"):
-        describe("car", things=f"{tmp_path}/thing.obj@4,2")
+        load_description("car", things=f"{tmp_path}/thing.obj@4,2")
     with pytest.raises(InputError, match="expected an object, x and y"):
         advsearch.load_scene("car", things=[{"object": "car", "x": 1}])
 
@@ -104,7 +104,7 @@ TURNED = SQUARE @ np.array([[0.7, 0.7, 0.0], [-0.7, 0.7, 0.0], [0.0, 0.0, 1.0]])
     ],
 )
 def test_what_stands_in_a_house_or_a_post_of_a_place_is_said(environment: str, thing: str, solid: str | None) -> None:
-    remarks = describe("car", environment, things=f"{thing},name=it").remarks
+    remarks = load_description("car", environment, things=f"{thing},name=it").remarks
     expected = () if solid is None else (f"It stands in {solid} of the place around it: put it elsewhere.",)
     assert remarks == expected
 
@@ -112,32 +112,32 @@ def test_what_stands_in_a_house_or_a_post_of_a_place_is_said(environment: str, t
 @pytest.mark.parametrize("kind", ["avenue", "crossing", "car-park"])
 def test_solids_of_a_place_are_where_its_meshes_are(kind: str) -> None:
     """Each post, trunk and house has some of its mesh's vertices at its outline, and the object stands free."""
-    scene = describe("car", "overcast", given={"ground.kind": kind})
+    scene = load_description("car", "overcast", given={"ground.kind": kind})
     assert not scene.remarks
     meshes = {"a house": "houses", "the trunk of a tree": "trees", "a lamp post": "posts"}
     meshes["the post of a sign"] = "sign-post"
-    solids = [solid for part in scene.around.values() for solid in part.solids]
+    solids = [solid for part in scene.surrounding_meshes.values() for solid in part.solids]
     assert {"a house", "the trunk of a tree", "a lamp post"} <= {name for name, _ in solids}
     for name, solid in solids:
-        vertices = standing(scene.around[meshes[name]])
+        vertices = compute_base_vertices(scene.surrounding_meshes[meshes[name]])
         low = solid.outline.min(axis=0) - 0.05
         high = solid.outline.max(axis=0) + 0.05
         near = ((vertices[:, :2] >= low) & (vertices[:, :2] <= high)).all(axis=1)
-        assert near.any() and vertices[near, 2].max() >= solid.high - 0.1, name
+        assert near.any() and vertices[near, 2].max() >= solid.upper - 0.1, name
 
 
 def test_a_room_has_walls_and_shelves_that_nothing_stands_in() -> None:
     for place, solid in (("0,1.95", "a wall"), ("-1.6,0", "a piece of furniture"), ("0.2,0.3", None)):
-        scene = describe("mug", "kitchen", given={"ground.kind": "room"}, things=f"mug@{place},name=it")
+        scene = load_description("mug", "kitchen", given={"ground.kind": "room"}, things=f"mug@{place},name=it")
         assert bool(scene.remarks) == (solid is not None)
         assert solid is None or solid in scene.remarks[0]
 
 
 def test_a_camera_inside_a_house_is_said_and_how_often_it_is_there() -> None:
     def notes(given: dict[str, float], **ranges: list[float]) -> tuple[str, ...]:
-        scene = describe("car", "avenue", given=given)
+        scene = load_description("car", "avenue", given=given)
         control = make_control("camera", dict(ranges)) if ranges else make_control("pose")
-        return make_space([control], scene).notes(scene)
+        return make_space([control], scene).list_notes(scene)
 
     inside = {"camera.azimuth": 90.0, "camera.distance": 20.0, "camera.elevation": 5.0}
     (said,) = notes(inside)
@@ -156,15 +156,15 @@ def test_a_camera_outside_a_room_is_said(distance: float, elevation: float, soli
         "camera.distance": distance,
         "camera.elevation": elevation,
     }
-    scene = describe("mug", "kitchen", given=given)
-    notes = make_space([make_control("pose")], scene).notes(scene)
+    scene = load_description("mug", "kitchen", given=given)
+    notes = make_space([make_control("pose")], scene).list_notes(scene)
     assert bool(notes) == (solid is not None)
     assert solid is None or f"The camera is inside {solid} of the place" in notes[-1]
 
 
 def test_outlines_overlap_where_squares_do() -> None:
     def overlap(one: np.ndarray, other: np.ndarray, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bool:
-        return overlapping(footprint(one), footprint(other + np.array(shift)))
+        return is_overlapping(compute_footprint(one), compute_footprint(other + np.array(shift)))
 
     assert overlap(SQUARE, TURNED) and overlap(SQUARE, SQUARE, (0.9, 0.9, 0.0))
     assert not overlap(SQUARE, SQUARE, (1.1, 0.0, 0.0))
@@ -174,14 +174,21 @@ def test_outlines_overlap_where_squares_do() -> None:
 
 
 def test_a_square_that_passes_another_overlaps_with_it_over_one_stretch_of_its_way() -> None:
-    square, way = footprint(SQUARE), np.array([1.0, 0.0])
-    assert blocked(square, footprint(SQUARE + np.array([3.0, 0.4, 0.0])), way) == pytest.approx((2.0, 4.0))
-    assert blocked(square, footprint(SQUARE + np.array([3.0, 1.4, 0.0])), way) == (math.inf, -math.inf)
-    corner = footprint(TURNED + np.array([3.0, 0.0, 0.0]))  # from -0.7 to 0.7 in x at y = 0.7, and 0 to 1.4 in y
-    begin, end = blocked(square, corner, way)
+    square, way = compute_footprint(SQUARE), np.array([1.0, 0.0])
+    assert find_overlap_interval(square, compute_footprint(SQUARE + np.array([3.0, 0.4, 0.0])), way) == pytest.approx(
+        (2.0, 4.0)
+    )
+    assert find_overlap_interval(square, compute_footprint(SQUARE + np.array([3.0, 1.4, 0.0])), way) == (
+        math.inf,
+        -math.inf,
+    )
+    corner = compute_footprint(
+        TURNED + np.array([3.0, 0.0, 0.0])
+    )  # from -0.7 to 0.7 in x at y = 0.7, and 0 to 1.4 in y
+    begin, end = find_overlap_interval(square, corner, way)
     for shift in np.linspace(0.003, 5.003, 501):
-        moved = footprint(SQUARE + np.array([shift, 0.0, 0.0]))
-        assert overlapping(moved, corner) == (begin < shift < end)
+        moved = compute_footprint(SQUARE + np.array([shift, 0.0, 0.0]))
+        assert is_overlapping(moved, corner) == (begin < shift < end)
 
 
 def projected_box(thing: str, x: float, y: float, heading: float, size: float) -> tuple[float, ...]:
@@ -215,7 +222,7 @@ def projected_box(thing: str, x: float, y: float, heading: float, size: float) -
 def test_boxes_are_those_of_an_independent_projection() -> None:
     scene = advsearch.load_scene("car", "street", settings=VIEW, things=THREE)
     renderer = scene.renderer({"pose": {}}, resolution=SIDE, denoise="none")
-    found = {one.name: one for one in seen_things(renderer, renderer.start)}
+    found = {one.name: one for one in find_visible_meshes(renderer, renderer.start)}
     metres = {name: float(library.load_object(name).metres or 0.0) for name in ("car", "stop-sign")}
     for name, what, *place in (
         ("object", "car", 0.0, 0.0, 0.0, metres["car"]),
@@ -225,7 +232,7 @@ def test_boxes_are_those_of_an_independent_projection() -> None:
     ):
         wanted = projected_box(what, *place)
         assert np.abs(np.array(found[name].box) - wanted).max() <= 1.0, (name, found[name].box, wanted)
-        assert (found[name].share or 0.0) > 0.97 and found[name].truncated is False
+        assert (found[name].visible_fraction or 0.0) > 0.97 and found[name].is_truncated is False
 
 
 @pytest.mark.medium
@@ -236,10 +243,14 @@ def test_a_thing_hides_is_hidden_and_casts_a_shadow() -> None:
         scene = advsearch.load_scene("car", "noon", settings=behind, things=things)
         renderer = scene.renderer({"pose": {}}, resolution=96, denoise="none")
         pictures.append(renderer(renderer.start, seed=1, spp=16))
-        seen.append({one.name: one for one in seen_things(renderer, renderer.start)})
+        seen.append({one.name: one for one in find_visible_meshes(renderer, renderer.start)})
     hidden, hiding = seen[1]["object"], seen[1]["stop-sign"]
-    assert seen[1]["car"].share is not None and seen[1]["car"].share < 0.8  # behind the object
-    assert hidden.share is not None and hiding.share is not None and hidden.share < 0.95 < hiding.share
+    assert seen[1]["car"].visible_fraction is not None and seen[1]["car"].visible_fraction < 0.8  # behind the object
+    assert (
+        hidden.visible_fraction is not None
+        and hiding.visible_fraction is not None
+        and hidden.visible_fraction < 0.95 < hiding.visible_fraction
+    )
     assert hiding.distance < hidden.distance < seen[1]["car"].distance
     covered = torch.zeros(96, 96, dtype=torch.bool)
     for one in (*seen[0].values(), *seen[1].values()):
@@ -267,7 +278,7 @@ def test_a_matrix_of_transport_knows_what_stands_beside() -> None:
     with torch.no_grad():
         after, before = (renderer(one, seed=11, spp=64) for one in (darker, renderer.start))
         change = predicted(darker) - predicted(renderer.start)
-    hiding = next(one.mask for one in seen_things(renderer, renderer.start) if one.name == "stop-sign")
+    hiding = next(one.mask for one in find_visible_meshes(renderer, renderer.start) if one.name == "stop-sign")
     assert float(((change - (after - before)) ** 2).mean().sqrt()) < 0.15 * float(
         (after - before).square().mean().sqrt()
     )
@@ -279,7 +290,7 @@ def test_a_matrix_of_transport_knows_what_stands_beside() -> None:
 def test_light_on_surfaces_refuses_things_by_its_own_rule() -> None:
     def reason(things: str | None) -> str | None:
         scene = advsearch.load_scene("mug", size=0.1, things=things)
-        refusal = why_not(scene.renderer({"camera": {}}, resolution=16, denoise="oidn"), ["camera"])
+        refusal = find_refusal(scene.renderer({"camera": {}}, resolution=16, denoise="oidn"), ["camera"])
         return None if refusal is None else refusal.text
 
     assert reason(None) is None
@@ -289,7 +300,9 @@ def test_light_on_surfaces_refuses_things_by_its_own_rule() -> None:
 @pytest.mark.medium
 def test_a_thing_on_the_pavement_stands_on_it() -> None:
     description = advsearch.load_scene("car", "avenue", things="chair@0,-4,size=1; stop-sign@9,0.5").description
-    low = {name: standing(part)[:, 2].min() * description.metres for name, part in description.things.items()}
+    low = {
+        name: compute_base_vertices(part)[:, 2].min() * description.metres for name, part in description.things.items()
+    }
     assert low == {"chair": pytest.approx(0.12, abs=1e-4), "stop-sign": pytest.approx(0.0, abs=1e-4)}
 
 

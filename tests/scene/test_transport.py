@@ -19,12 +19,12 @@ from advsearch.engine import transport as searching
 from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
-from advsearch.questions.attack.summary import attack_of
+from advsearch.questions.attack.summary import load_attack_summary
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
 from advsearch.scene.transport import matrix as linear
-from advsearch.scene.transport.matrix import COARSE, TextureTransport
+from advsearch.scene.transport.matrix import CELL_SIZE, TextureTransport
 from stand_ins import Impatient, rows
 
 SIZE = 64
@@ -76,9 +76,9 @@ def test_a_fine_pattern_is_compared_without_the_denoiser(renderer: Renderer, pre
     """Which takes it for noise: with the pattern, a prediction is as near as at the start."""
     squares = []
     for u in (renderer.start, changed(renderer, 0.1, "signs")):
-        halves = renderer.halves(u, 5, 64)[:2]
+        halves = renderer.render_halves(u, 5, 64)[:2]
         with torch.no_grad():
-            squares.append(acceptance.squares_off(predicted(u), halves, renderer.mask(u)))
+            squares.append(acceptance.compute_squared_error(predicted(u), halves, renderer.mask(u)))
     assert squares[1] < squares[0] + 1.0
 
 
@@ -113,10 +113,10 @@ def vertices(rows: Sequence[tuple[int, float, float, float]], sharp: bool = True
 def test_a_lookup_is_bilinear_and_repeats_at_the_border() -> None:
     """One vertex in the middle of a texel, one between two, one over the corner; their weights add up."""
     made = TextureTransport((1, 3), (4, 4))
-    made.add([vertices([(0, 0.375, 0.625, 2.0), (1, 0.5, 0.625, 2.0), (2, 0.0, 0.0, 4.0)])], share=0.5)
+    made.add_pass([vertices([(0, 0.375, 0.625, 2.0), (1, 0.5, 0.625, 2.0), (2, 0.0, 0.0, 4.0)])], fraction=0.5)
     made.finish()
     texture = torch.arange(16.0).reshape(4, 4, 1).expand(-1, -1, 3).contiguous()
-    seen = made.times(texture)[0, :, 0]
+    seen = made.multiply(texture)[0, :, 0]
     corners = (texture[0, 0, 0] + texture[0, 3, 0] + texture[3, 0, 0] + texture[3, 3, 0]) / 4.0
     assert seen.tolist() == pytest.approx([9.0, 9.5, 2.0 * float(corners)], rel=HALF)
 
@@ -125,13 +125,13 @@ def test_the_transpose_is_one() -> None:
     generator = torch.Generator().manual_seed(0)
     places = torch.rand(60, 2, generator=generator)
     rows = [(int(60 * x) % 12, float(x), float(y), float(x - y)) for x, y in places]
-    made = TextureTransport((3, 4), (COARSE + 3, 2 * COARSE))
-    made.add([vertices(rows[:30]), vertices(rows[30:], sharp=False)], share=1.0)
+    made = TextureTransport((3, 4), (CELL_SIZE + 3, 2 * CELL_SIZE))
+    made.add_pass([vertices(rows[:30]), vertices(rows[30:], sharp=False)], fraction=1.0)
     made.finish()
-    change = torch.randn(COARSE + 3, 2 * COARSE, 3, generator=generator)
+    change = torch.randn(CELL_SIZE + 3, 2 * CELL_SIZE, 3, generator=generator)
     cotangent = torch.randn(3, 4, 3, generator=generator)
-    forward = float((made.times(change) * cotangent).sum())
-    assert forward == pytest.approx(float((change * made.transposed_times(cotangent)).sum()), rel=1e-5)
+    forward = float((made.multiply(change) * cotangent).sum())
+    assert forward == pytest.approx(float((change * made.multiply_transposed(cotangent)).sum()), rel=1e-5)
 
 
 @pytest.mark.parametrize(("texture", "bytes_an_entry"), [((256, 256), 4), ((257, 256), 6)])
@@ -140,25 +140,25 @@ def test_what_is_kept_small_says_the_same(texture: tuple[int, int], bytes_an_ent
     seen = [vertices([(0, 0.3, 0.3, 1.0), (0, 0.999, 0.999, 3.0), (1, 0.7, 0.2, 1.0)])]
     made, small = (TextureTransport((1, 2), texture, small=one) for one in (False, True))
     for one in (made, small):
-        one.add(seen, share=1.0)
+        one.add_pass(seen, fraction=1.0)
         one.finish()
     change = torch.rand(*texture, 3, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(small.times(change), made.times(change), rtol=HALF, atol=0.0)
+    torch.testing.assert_close(small.multiply(change), made.multiply(change), rtol=HALF, atol=0.0)
     cotangent = torch.ones(1, 2, 3)
-    both = small.transposed_times(cotangent), made.transposed_times(cotangent)
+    both = small.multiply_transposed(cotangent), made.multiply_transposed(cotangent)
     torch.testing.assert_close(*both, rtol=2 * HALF, atol=1e-6)
     assert small.bytes == bytes_an_entry * small._first.entries + 2 * (4 + 6) * 2
 
 
 def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for() -> None:
-    made = TextureTransport((1, 2), (COARSE, COARSE))
-    made.add([vertices([(0, 0.3, 0.3, 1.0), (0, 0.8, 0.3, 3.0), (1, 0.3, 0.3, 1.0)])], share=1.0)
+    made = TextureTransport((1, 2), (CELL_SIZE, CELL_SIZE))
+    made.add_pass([vertices([(0, 0.3, 0.3, 1.0), (0, 0.8, 0.3, 3.0), (1, 0.3, 0.3, 1.0)])], fraction=1.0)
     made.finish(lambda picture: torch.full_like(picture, 2.0))
-    ones = torch.ones(COARSE, COARSE, 3)
-    assert made.times(ones)[0, :, 0].tolist() == pytest.approx([2.0, 2.0], rel=HALF)
+    ones = torch.ones(CELL_SIZE, CELL_SIZE, 3)
+    assert made.multiply(ones)[0, :, 0].tolist() == pytest.approx([2.0, 2.0], rel=HALF)
     left = ones.clone()
-    left[:, COARSE // 2 :] = 0.0
-    assert made.times(left)[0, :, 0].tolist() == pytest.approx([0.5, 2.0], rel=HALF, abs=1e-6)
+    left[:, CELL_SIZE // 2 :] = 0.0
+    assert made.multiply(left)[0, :, 0].tolist() == pytest.approx([0.5, 2.0], rel=HALF, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -174,13 +174,13 @@ def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for()
 )
 def test_where_it_can_predict(controls: object, options: dict[str, object], reason: str | None) -> None:
     made = advsearch.load_scene("mug").renderer(controls, resolution=16, **options)  # type: ignore[arg-type]
-    refusal = lights.why_not(made)
+    refusal = lights.find_refusal(made)
     assert (None if refusal is None else refusal.text) == reason
 
 
 @pytest.mark.medium
 def test_a_matrix_that_is_too_large_is_not_made(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(linear, "MOST_BYTES", 1000)
+    monkeypatch.setattr(linear, "MAX_BYTES", 1000)
     with pytest.raises(linear.TransportTooLargeError, match="would take more than"):
         linear.LinearRenderer(renderer, renderer.start, seed=1)
 
@@ -193,7 +193,7 @@ SMALL = {"resolution": SIZE, "trials": 6, "steps": 18, "verify_spp": 8, "control
 @pytest.mark.medium
 def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
     made, guesses = 0, 0
-    linearised, likely = lights.predicting, searching.Transport.likely
+    linearised, likely = lights.make_predictor, searching.Transport.is_likely_success
 
     def counted(*given: Any) -> Any:
         nonlocal made
@@ -205,9 +205,9 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
         guesses += 1
         return likely(self, u)
 
-    monkeypatch.setattr(searching, "predicting", counted)
-    monkeypatch.setattr(searching.Transport, "likely", guessed)
-    monkeypatch.setattr(acceptance, "BOUND", 100.0)
+    monkeypatch.setattr(searching, "make_predictor", counted)
+    monkeypatch.setattr(searching.Transport, "is_likely_success", guessed)
+    monkeypatch.setattr(acceptance, "MIN_ALLOWED_LEVELS", 100.0)
     found = advsearch.attack("mug", smallest=True, baseline=False, run=None, **SMALL).summary  # type: ignore[arg-type]
     assert found.smallest is not None and found.smallest.epsilon is not None and found.smallest.searches > 1
     assert made == 1 and guesses >= 5
@@ -216,20 +216,20 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
 @pytest.mark.medium
 @pytest.mark.slow
 def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    made, linearised = 0, lights.predicting
+    made, linearised = 0, lights.make_predictor
 
     def counted(*given: Any) -> Any:
         nonlocal made
         made += 1
         return linearised(*given)
 
-    monkeypatch.setattr(searching, "predicting", counted)
+    monkeypatch.setattr(searching, "make_predictor", counted)
     settings: Any = {**SMALL, "baseline": False, "average": 0, "resolution": (SIZE, SIZE)}
     config = AttackConfig(object="mug", epsilon="0.002,0.004", run=str(tmp_path / "curve"), **settings)
     found = run_and_save(curve, RunContext(config))
     assert made == 1 and [one.robust for one in found.curve] == [1, 1]
     alone = advsearch.attack("mug", epsilon=0.004, run=tmp_path / "alone", **settings)
-    shared = attack_of(tmp_path / "curve" / "parts" / found.parts[1])
+    shared = load_attack_summary(tmp_path / "curve" / "parts" / found.parts[1])
     assert made == 2 and alone.summary.verified is not None and shared.verified == alone.summary.verified
     assert shared.transport is not None and shared.transport.seconds == 0.0
 
@@ -239,11 +239,11 @@ def test_a_guess_learns_how_optimistic_a_prediction_was(monkeypatch: pytest.Monk
     monkeypatch.setattr(searching.Transport, "_predict_score", lambda self, u: float(u))
     problem: Any = None
     made = searching.Transport(problem, 1)
-    assert made.likely(torch.tensor(0.1)) and not made.likely(torch.tensor(-0.1))
-    made.correct(torch.tensor(5.0), [3.5, 4.5] * 4)
+    assert made.is_likely_success(torch.tensor(0.1)) and not made.is_likely_success(torch.tensor(-0.1))
+    made.update_score_bias(torch.tensor(5.0), [3.5, 4.5] * 4)
     for scores in ([1.0, 2.0], [math.nan] * 6):  # too few to say anything, or none
-        made.correct(torch.tensor(9.0), scores)
-    assert not made.likely(torch.tensor(1.7)) and made.likely(torch.tensor(2.0))
+        made.update_score_bias(torch.tensor(9.0), scores)
+    assert not made.is_likely_success(torch.tensor(1.7)) and made.is_likely_success(torch.tensor(2.0))
 
 
 @pytest.mark.medium
@@ -252,9 +252,9 @@ def test_a_search_says_what_predicted_its_pictures_and_one_that_goes_on_ends_wit
 ) -> None:
     """It compares, and makes the matrix anew where that is off. What is read back is not predicted again: the matrix
     was made anew once before the interrupt."""
-    monkeypatch.setattr(searching, "EVERY", 6)
-    monkeypatch.setattr(acceptance, "MARGIN", 0.0)
-    monkeypatch.setattr(acceptance, "OF_MOVED", 0.0)
+    monkeypatch.setattr(searching, "COMPARISON_INTERVAL", 6)
+    monkeypatch.setattr(acceptance, "MAX_MARGIN_BIAS", 0.0)
+    monkeypatch.setattr(acceptance, "MAX_BIAS_FRACTION", 0.0)
     settings: Any = {**SMALL, "baseline": False, "deterministic": True}
     found = advsearch.attack("mug", run=tmp_path / "whole", **settings)
     told, renders = found.summary.transport, found.summary.renders

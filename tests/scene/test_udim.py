@@ -13,8 +13,8 @@ from test_wavefront import MAPPED, USED, areas, picture, read
 from advsearch.errors import FileFormatError
 from advsearch.scene.importing import mtl_surfaces
 from advsearch.scene.importing.objects import import_object, read_parts
-from advsearch.scene.importing.parts import holds_normals
-from advsearch.scene.importing.texture import mean_over
+from advsearch.scene.importing.parts import has_normals
+from advsearch.scene.importing.texture import average_over_faces
 
 RED, BLUE = np.full((4, 4, 3), (255, 0, 0)), np.full((4, 4, 3), (0, 0, 255))
 TWO = (
@@ -81,15 +81,15 @@ def test_one_picture_with_a_number_in_its_name_repeats_and_is_said(tmp_path: Pat
     ],
 )
 def test_numbers_in_names(name: str, number: int | None) -> None:
-    assert mtl_surfaces.number_in(name) == number
+    assert mtl_surfaces.find_square(name) == number
     if number is not None:
-        assert mtl_surfaces.named(name, 1013) in ("a.1013.png", "a1013.exr", "a1013.png")
+        assert mtl_surfaces.replace_square(name, 1013) in ("a.1013.png", "a1013.exr", "a1013.png")
 
 
 def test_squares_are_numbered_as_udim_has_them() -> None:
     at = np.array([[0.5, 0.5], [9.5, 0.5], [0.5, 1.5], [2.5, 3.5], [-0.5, 0.5], [10.5, 0.5]])
-    assert mtl_surfaces.squares(at[:, None].repeat(3, axis=1)).tolist() == [1001, 1010, 1011, 1033, 0, 0]
-    assert [mtl_surfaces.corner_of(one) for one in (1001, 1010, 1033, 0)] == [(0, 0), (9, 0), (2, 3), (0, 0)]
+    assert mtl_surfaces.compute_squares(at[:, None].repeat(3, axis=1)).tolist() == [1001, 1010, 1011, 1033, 0, 0]
+    assert [mtl_surfaces.get_square_corner(one) for one in (1001, 1010, 1033, 0)] == [(0, 0), (9, 0), (2, 3), (0, 0)]
 
 
 # ---- faces of one and two corners -----------------------------------------------------------------------------------
@@ -176,17 +176,19 @@ def test_a_mean_weighs_faces_by_their_area() -> None:
     left = np.array([[0.0, 0.0], [0.25, 0.0], [0.0, 1.0]])
     right = left + np.array([0.5, 0.0])
     uvs = np.stack([left, right])
-    lone = [float(mean_over(columns, one[None], np.ones(1))[0]) for one in (left, right)]
+    lone = [float(average_over_faces(columns, one[None], np.ones(1))[0]) for one in (left, right)]
     assert lone == pytest.approx([0.25 / 3, 0.5 + 0.25 / 3], abs=0.01)
-    both = float(mean_over(columns, uvs, np.array([3.0, 1.0]))[0])
+    both = float(average_over_faces(columns, uvs, np.array([3.0, 1.0]))[0])
     assert both == pytest.approx(0.75 * lone[0] + 0.25 * lone[1], abs=1e-3)
-    assert float(mean_over(columns, np.full((2, 3, 2), np.nan), np.ones(2))[0]) == pytest.approx(columns.mean())
+    assert float(average_over_faces(columns, np.full((2, 3, 2), np.nan), np.ones(2))[0]) == pytest.approx(
+        columns.mean()
+    )
 
 
 def test_a_normal_map_with_black_between_its_charts_is_one() -> None:
     map = np.zeros((16, 16, 3), np.float32)
-    assert not holds_normals(map)
+    assert not has_normals(map)
     map[:4] = (0.5, 0.5, 1.0)
-    assert holds_normals(map)
+    assert has_normals(map)
     map[:4] = 0.5
-    assert not holds_normals(map)
+    assert not has_normals(map)

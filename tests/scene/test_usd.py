@@ -16,8 +16,8 @@ from PIL import Image
 import advsearch
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import ObjectAsset
-from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.glb import glb
+from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing import usd
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import contents
@@ -112,7 +112,7 @@ def y_up(vectors: Any) -> np.ndarray:
 def mug(tmp_path: Path) -> tuple[ObjectAsset, Path]:
     """The bundled mug, and a folder with its twin in glTF and its texture."""
     made = load_object("mug")
-    (tmp_path / "twin.glb").write_bytes(glb([made]))
+    (tmp_path / "twin.glb").write_bytes(encode_glb([made]))
     picture = Image.fromarray(np.uint8(np.clip(made.base_color, 0, 1) * 255 + 0.5))
     picture.save(tmp_path / "skin.png")
     return made, tmp_path
@@ -336,7 +336,7 @@ ROOM = f"""
 @needs_usd
 def test_nodes_cameras_and_lights_are_those_of_the_file(tmp_path: Path) -> None:
     """Radiance times the disk of a sphere is its intensity; normalised, the power is that of the number."""
-    scene = describe(f"{written(tmp_path, ROOM, unit=0.5)}#book")
+    scene = load_description(f"{written(tmp_path, ROOM, unit=0.5)}#book")
     assert set(scene.meshes) == {"object", "jar"}
     jar = scene.meshes["jar"].to_world
     assert np.allclose(jar[:3, 3], [3.0, -3.0, 3.0]), "z up, in sizes of the book"

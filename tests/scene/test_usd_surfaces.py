@@ -194,12 +194,12 @@ def png_of_16_bits(values: np.ndarray, filters: list[int]) -> bytes:
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 def test_pictures_of_16_bits_are_linear_to_the_last_bit(channels: int) -> None:
-    from advsearch.scene.importing.usd.pictures import decode_picture, is_marked_srgb
+    from advsearch.scene.importing.usd.pictures import decode_image, is_marked_srgb
 
     values = np.random.default_rng(4).integers(0, 65536, (5, 7, channels))
     data = png_of_16_bits(values, [0, 1, 2, 3, 4])
     assert not is_marked_srgb(data)
-    texels = decode_picture(data, "a.png", is_srgb=False)
+    texels = decode_image(data, "a.png", is_srgb=False)
     colors = np.broadcast_to(values[:, :, :3] if channels > 2 else values[:, :, :1], (5, 7, 3)) / 65535
     assert np.allclose(texels[:, :, :3], colors, atol=1e-6) or channels == 2
     if channels in (2, 4):
@@ -506,7 +506,7 @@ def test_splats_are_named_first_and_in_full(tmp_path: Path) -> None:
 
 def splats_glb(folder: Path, *, with_mesh: bool, required: bool = False) -> Path:
     buffer = GlbBuffer()
-    points = buffer.accessor(np.eye(3, dtype=np.float32), "VEC3", bounds=True)
+    points = buffer.add_accessor(np.eye(3, dtype=np.float32), "VEC3", bounds=True)
     name = "KHR_gaussian_splatting"
     attributes = {"POSITION": points, f"{name}:SCALE": points}
     splats = {"mode": 0, "attributes": attributes, "extensions": {name: {"kernel": "ellipse"}}}
@@ -519,7 +519,7 @@ def splats_glb(folder: Path, *, with_mesh: bool, required: bool = False) -> Path
         "nodes": [{"mesh": 0}],
     }
     file = folder / "splats.glb"
-    file.write_bytes(buffer.file(header))
+    file.write_bytes(buffer.to_bytes(header))
     return file
 
 

@@ -9,10 +9,17 @@ import numpy as np
 import pytest
 
 from advsearch.controls import make_control, make_space
-from advsearch.engine.loading import Scene, framed, load_scene
+from advsearch.engine.loading import Scene, fit_camera, load_scene
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.grounds import CameraView, Surroundings, past, surroundings_of, valid, view_of
+from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.grounds import (
+    CameraView,
+    Surroundings,
+    find_surroundings,
+    find_valid_range,
+    list_view_remarks,
+    make_camera_view,
+)
 from advsearch.scene.library import load_environment, load_object
 from scenes.places.road import EDGES, EYE, LENGTH
 
@@ -50,11 +57,11 @@ def seen(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 def depression(scene: Scene) -> float:
     """Degrees below the horizon at which houses begin in the middle of the picture."""
     houses, _ = seen(scene)
-    view = view_of(framed(scene.description, SIDE))
+    view = make_camera_view(fit_camera(scene.description, SIDE))
     row = SIDE - int(np.argmax(houses[::-1, 3]))  # the lowest of the first columns, beside the car
     half = math.radians(scene.description.number("camera.fov")) / 2.0
     slope = (2.0 * row / SIDE - 1.0) * math.tan(half)
-    return view.lowest - math.degrees(half) + math.degrees(math.atan(slope))
+    return view.lower_angle - math.degrees(half) + math.degrees(math.atan(slope))
 
 
 @pytest.mark.medium
@@ -77,9 +84,9 @@ def test_houses_are_as_much_too_high_as_the_formula_says(height: float) -> None:
 def test_the_road_ends_in_sight_where_the_formula_says(side: float) -> None:
     scene = street(10.0, 1.6, side).description
     border = EDGES[1] if side == 90.0 else -EDGES[0]
-    limit = border + 1.6 / math.tan(math.radians(view_of(framed(scene, SIDE)).lowest))
-    free = replace(surroundings_of(scene) or Surroundings(1.0, 1.0, 1.0), stands=math.inf)
-    assert valid(free, view_of(scene))[0] == pytest.approx(limit, rel=0.02)
+    limit = border + 1.6 / math.tan(math.radians(make_camera_view(fit_camera(scene, SIDE)).lower_angle))
+    free = replace(find_surroundings(scene) or Surroundings(1.0, 1.0, 1.0), nearest_distance=math.inf)
+    assert find_valid_range(free, make_camera_view(scene))[0] == pytest.approx(limit, rel=0.02)
     _, inside = seen(street(limit - 1.0, 1.6, side))
     _, outside = seen(street(limit + 1.0, 1.6, side))
     assert inside[-1].all()
@@ -96,22 +103,29 @@ def test_from_60_m_the_houses_stand_below_the_road() -> None:
 
     assert not below(11.5)
     assert below(60.0)
-    assert valid(surroundings_of(street(60.0, 1.6).description), view_of(street(60.0, 1.6).description))[0] < 20.0  # type: ignore[arg-type]
+    assert (
+        find_valid_range(
+            find_surroundings(street(60.0, 1.6).description), make_camera_view(street(60.0, 1.6).description)
+        )[0]
+        < 20.0
+    )  # type: ignore[arg-type]
 
 
 def test_along_a_street_it_fits_as_far_as_its_road() -> None:
-    scene = describe("car", "street", given={"camera.azimuth": 0.0, "camera.elevation": 2.0, "camera.distance": 40.0})
-    far, high = valid(surroundings_of(scene), view_of(scene))  # type: ignore[arg-type]
+    scene = load_description(
+        "car", "street", given={"camera.azimuth": 0.0, "camera.elevation": 2.0, "camera.distance": 40.0}
+    )
+    far, high = find_valid_range(find_surroundings(scene), make_camera_view(scene))  # type: ignore[arg-type]
     assert LENGTH / 2.0 < far < LENGTH / 2.0 + 10.0
     assert high == 2.0 * EYE
-    assert not past(scene, [view_of(scene)])
+    assert not list_view_remarks(scene, [make_camera_view(scene)])
 
 
 def photographed(height: float | None = None, radius: float | None = None, **said: float) -> SceneDescription:
     given = {"ground.height": height, "ground.radius": radius}
     lit = EnvironmentAsset("hall", np.ones((8, 16, 3), np.float32), photographed=True)
     loose = replace(load_object("mug"), metres=None)
-    return describe(loose, lit, given={name: one for name, one in given.items() if one is not None}, **said)  # type: ignore[arg-type]
+    return load_description(loose, lit, given={name: one for name, one in given.items() if one is not None}, **said)  # type: ignore[arg-type]
 
 
 def test_a_photograph_fits_by_its_height_and_its_empty_floor() -> None:
@@ -121,25 +135,25 @@ def test_a_photograph_fits_by_its_height_and_its_empty_floor() -> None:
         (photographed(2.0, 3.0, size=0.1), 3.0, 4.0),
         (photographed(), 15.0, 6.0),
     ):
-        assert valid(surroundings_of(scene), view_of(scene)) == pytest.approx((far, high))  # type: ignore[arg-type]
-        assert not past(scene, [view_of(scene)])
+        assert find_valid_range(find_surroundings(scene), make_camera_view(scene)) == pytest.approx((far, high))  # type: ignore[arg-type]
+        assert not list_view_remarks(scene, [make_camera_view(scene)])
     away = replace(photographed(size=0.1), values={**photographed(size=0.1).values, "camera.distance": 9.0})
     assert (
         "a picture, which fits a camera up to 8 m away and 3.2 m high; the camera is 8."
-        in past(away, [view_of(away)])[0]
+        in list_view_remarks(away, [make_camera_view(away)])[0]
     )
 
 
 def test_what_has_no_ground_to_fit_has_no_bound() -> None:
     for scene in (
-        describe("mug", "studio"),
-        describe("car", "noon"),
-        describe("mug", "street", given={"ground.size": 0.0}),
+        load_description("mug", "studio"),
+        load_description("car", "noon"),
+        load_description("mug", "street", given={"ground.size": 0.0}),
     ):
-        assert surroundings_of(scene) is None
-    noon = describe("car", "noon", given={"ground.kind": "road"})
-    assert valid(surroundings_of(noon), view_of(noon))[1] == math.inf  # type: ignore[arg-type]
-    assert valid(Surroundings(1.5, 12.0, math.inf), CameraView(0.0, 180.0, 0.0, 1.0, -3.0)) == (12.0, 3.0)
+        assert find_surroundings(scene) is None
+    noon = load_description("car", "noon", given={"ground.kind": "road"})
+    assert find_valid_range(find_surroundings(noon), make_camera_view(noon))[1] == math.inf  # type: ignore[arg-type]
+    assert find_valid_range(Surroundings(1.5, 12.0, math.inf), CameraView(0.0, 180.0, 0.0, 1.0, -3.0)) == (12.0, 3.0)
 
 
 @pytest.mark.parametrize(
@@ -156,8 +170,8 @@ def test_what_has_no_ground_to_fit_has_no_bound() -> None:
     ],
 )
 def test_a_search_that_goes_past_it_says_so(controls: dict[str, dict[str, object]], words: str) -> None:
-    scene = describe("car", "street")
-    notes = make_space([make_control(name, said) for name, said in controls.items()], scene).notes(scene)
+    scene = load_description("car", "street")
+    notes = make_space([make_control(name, said) for name, said in controls.items()], scene).list_notes(scene)
     assert len(notes) == bool(words)
     if words:
         with pytest.raises(AssertionError, match=words):
@@ -165,6 +179,6 @@ def test_a_search_that_goes_past_it_says_so(controls: dict[str, dict[str, object
 
 
 def test_a_street_that_is_turned_fits_nowhere() -> None:
-    scene = describe("car", "street", given={"environment.rotation": 30.0, "camera.elevation": 3.0})
-    assert valid(surroundings_of(scene), view_of(scene)) == (0.0, 0.0)  # type: ignore[arg-type]
-    assert "turns against the road" in past(scene, [view_of(scene)])[0]
+    scene = load_description("car", "street", given={"environment.rotation": 30.0, "camera.elevation": 3.0})
+    assert find_valid_range(find_surroundings(scene), make_camera_view(scene)) == (0.0, 0.0)  # type: ignore[arg-type]
+    assert "turns against the road" in list_view_remarks(scene, [make_camera_view(scene)])[0]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.mtl_surfaces import map_of
+from advsearch.scene.importing.mtl_surfaces import parse_map
 from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.parts import ImportedPart
 
@@ -80,7 +80,7 @@ def areas(part: ImportedPart) -> np.ndarray:
     ],
 )
 def test_options_and_names_of_maps(rest: str, name: str | None, options: dict[str, str] | None) -> None:
-    use = map_of(rest)
+    use = parse_map(rest)
     assert (use and use.name) == name
     assert use is None or options is None or use.options == options
 
@@ -395,6 +395,6 @@ def test_whatever_a_file_has_is_read_or_named(
 
 @pytest.mark.parametrize("option", ["-mm", "-bm", "-s", "-o", "-mm nan", "-s 1e9 1e9"])
 def test_an_option_of_a_map_that_says_too_little_does_nothing(option: str) -> None:
-    used = map_of(f"{option} paint.png")
+    used = parse_map(f"{option} paint.png")
     assert used is not None
     assert (used.scale, used.offset, used.range, used.bump) == ((1.0, 1.0), (0.0, 0.0), (0.0, 1.0), 1.0)

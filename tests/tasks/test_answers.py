@@ -12,7 +12,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.errors import InputError, ModelError
 from advsearch.tasks import Facts, Prediction, make_task
-from advsearch.tasks.answers import FreeAnswer, Utterance, has_word
+from advsearch.tasks.answers import AnswerWithLogits, FreeAnswer, has_word
 
 VOCABULARY = ("a", "mug", "cup", "bowl", ".")
 
@@ -21,14 +21,14 @@ def begins(word: str) -> Sequence[int]:
     return [number for number, known in enumerate(VOCABULARY) if known == word]
 
 
-def said(text: str, logits: Tensor) -> Utterance:
+def said(text: str, logits: Tensor) -> AnswerWithLogits:
     return {"text": text, "logits": logits, "begins": begins}
 
 
 class Speaker(nn.Module):
     """Says "mug ." of a picture that is bright, and "bowl ." of a dark one."""
 
-    def forward(self, images: Tensor) -> list[Utterance]:
+    def forward(self, images: Tensor) -> list[AnswerWithLogits]:
         bright = images.mean(dim=(1, 2, 3)) - 0.5
         found = []
         for one in bright:
@@ -70,7 +70,7 @@ def test_the_text_alone_says_what_is_right() -> None:
     assert first.right and not first.success and second.success and not second.right
     assert (first.prediction.label, second.prediction.label) == ("cup", "(nothing)")
     assert task.predictions([said("a\n\x1b[2J cup", logits)]) == [(Prediction("a [2J cup"),)]
-    assert task.judge([said("cup", logits * math.nan)], ("cup",))[0].not_a_number
+    assert task.judge([said("cup", logits * math.nan)], ("cup",))[0].is_not_a_number
 
 
 def test_a_target_is_a_word_that_is_said() -> None:

@@ -16,7 +16,7 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, ModelError
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.options import as_setting
+from advsearch.options import to_setting
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.tasks import Facts, make_task
 from advsearch.tasks.command import Command
@@ -108,7 +108,7 @@ def test_the_margin_is_the_largest_difference_in_envelopes_less_one() -> None:
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_an_action_that_is_no_number_is_neither_right_nor_a_success(bad: float) -> None:
     (judgement,) = judged().judge(torch.tensor([[bad, -0.2]]), torch.tensor([0.1, -0.2]))
-    assert judgement.not_a_number and not judgement.right and not judgement.success and judgement.payload is None
+    assert judgement.is_not_a_number and not judgement.right and not judgement.success and judgement.payload is None
     with pytest.raises(InputError, match="the clean action has NaN or infinity"):
         Command(envelope=1).after_calibration(torch.tensor([[bad]]), None)
 
@@ -176,7 +176,7 @@ def test_a_state_is_read_from_a_file_that_is_not_trusted(tmp_path: Path) -> None
     file = tmp_path / "state.json"
     file.write_text(json.dumps({"speed": 2, "joints": [0.1, 0.2]}))
     task = Command(state=str(file), envelope=1)
-    assert task.state == {"speed": (2.0,), "joints": (0.1, 0.2)} and make_task(as_setting(task)) == task
+    assert task.state == {"speed": (2.0,), "joints": (0.1, 0.2)} and make_task(to_setting(task)) == task
     for text in ("[1]", "{", '{"a": NaN}', '{"a": "b"}', "1" * (1 << 21), "[" * 1000):
         file.write_text(text)
         with pytest.raises(AdvsearchError):
@@ -188,9 +188,9 @@ def test_a_state_is_read_from_a_file_that_is_not_trusted(tmp_path: Path) -> None
 
 def test_options_of_an_instance_are_written_down() -> None:
     task = make_task(ASKED)
-    setting = as_setting(task)
+    setting = to_setting(task)
     assert setting == {"name": "command", "state": {"speed": [2.0]}, "envelope": [0.4], "names": ["yaw rate"], "units": ["rad/s"]}  # fmt: skip # noqa: E501
-    assert make_task(json.loads(json.dumps(setting))) == task and as_setting(Command()) == "command"
+    assert make_task(json.loads(json.dumps(setting))) == task and to_setting(Command()) == "command"
 
 
 # ---- policies -------------------------------------------------------------------------------------------------------

@@ -22,16 +22,16 @@ from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Facts, Sight, make_task
 from advsearch.tasks.depth import (
+    AS_BACKGROUND,
     AS_FAR,
     DISPARITY,
     FARTHER,
-    GONE,
     METRIC,
     NEARER,
     OUT_OF_SHAPE,
     RELATIVE,
     Depth,
-    Distances,
+    DepthTruth,
 )
 from small_models import SIDE, Ranger
 
@@ -41,9 +41,9 @@ MASK[2:7, 3:7] = True
 GROUND = torch.linspace(0.2, 0.5, HIGH)[:, None].expand(HIGH, WIDE)
 """Disparities of a plane."""
 INVERSE = torch.where(MASK, 1.2, GROUND)
-TRUTH = Distances(MASK, INVERSE.reciprocal())
+TRUTH = DepthTruth(MASK, INVERSE.reciprocal())
 OTHERS = torch.where(MASK, 1.2, torch.where(torch.arange(HIGH)[:, None] < 3, 0.0, GROUND))
-OPEN = Distances(MASK, OTHERS.reciprocal())
+OPEN = DepthTruth(MASK, OTHERS.reciprocal())
 """The same with a sky above the ground."""
 
 
@@ -84,18 +84,20 @@ def test_an_object_that_takes_the_depth_of_what_is_behind_is_gone() -> None:
         (found,) = gone.judge(said(inverse), TRUTH)
         payload: Any = found.payload
         assert payload["relief"] == pytest.approx(left, abs=1e-3)
-        assert found.success is (left < 0.5) and (found.prediction.label == GONE) is (left < 0.5)
+        assert found.success is (left < 0.5) and (found.prediction.label == AS_BACKGROUND) is (left < 0.5)
     (found,) = replace(TASK, seek="farther").judge(said(GROUND), TRUTH)
     assert found.success and found.prediction.label == FARTHER, "what is sought is named first"
 
 
 def test_behind_the_object_is_what_is_beside_it_in_its_row() -> None:
-    assert torch.allclose(TRUTH.behind[MASK], GROUND[MASK])
-    assert OPEN.behind[2, 3:7].tolist() == [0.0] * 4 and torch.allclose(OPEN.behind[4], GROUND[4])
+    assert torch.allclose(TRUTH.background_disparity[MASK], GROUND[MASK])
+    assert OPEN.background_disparity[2, 3:7].tolist() == [0.0] * 4 and torch.allclose(
+        OPEN.background_disparity[4], GROUND[4]
+    )
     edge = MASK.clone()
     edge[3] = True
     edge[4, :7] = True
-    behind = Distances(edge, INVERSE.reciprocal()).behind
+    behind = DepthTruth(edge, INVERSE.reciprocal()).background_disparity
     assert bool(behind[3].isnan().all()) and torch.allclose(behind[4], GROUND[4])
 
 
@@ -118,24 +120,24 @@ def test_near_does_not_become_far_by_a_negative_scale() -> None:
 
 
 def test_where_nothing_is_seen_nothing_is_wrong_and_where_numbers_are_none_nothing_is_right() -> None:
-    unseen = Distances(torch.zeros_like(MASK), TRUTH.z)
+    unseen = DepthTruth(torch.zeros_like(MASK), TRUTH.z)
     (found,) = TASK.judge(said(GROUND), unseen)
     assert (found.right, found.prediction.label, found.payload) == (True, "out of view", None)
     for value in (math.nan, math.inf):
         broken = said(INVERSE)
         broken[0][DISPARITY][0, 0] = value
         (found,) = TASK.judge(broken, TRUTH)
-        assert found.not_a_number and not found.right and not found.success
+        assert found.is_not_a_number and not found.right and not found.success
         assert TASK.predictions(broken)[0][0].label == NOT_A_NUMBER
     assert TASK.predictions(said(INVERSE, METRIC))[0][0].label == "metric depth from 0.417 to 2.5"
 
 
 def test_what_is_beside_the_object_has_to_say_the_scale() -> None:
     """In a scene that is all object, or seen from above: refused when a run begins, and fitted on all that there is."""
-    alone = Distances(MASK, torch.where(MASK, 1.0 / 1.2, math.inf))
-    above = Distances(MASK, torch.where(MASK, 1.0, 2.0))
+    alone = DepthTruth(MASK, torch.where(MASK, 1.0 / 1.2, math.inf))
+    above = DepthTruth(MASK, torch.where(MASK, 1.0, 2.0))
     for truth, count in ((alone, 0), (above, 60)):
-        assert not truth.anchored
+        assert not truth.determines_scale
         task = TASK.after_calibration(said(INVERSE), truth)
         assert f"expected 16 pixels at distances that differ by a factor of 1.1, got {count}" in task.ambiguities
         assert not TASK.after_calibration(said(INVERSE, METRIC), truth).ambiguities
@@ -169,7 +171,7 @@ def test_what_has_to_be_said_is_said() -> None:
         "how large the object is is not known; give its longest side in metres"
         in Depth().after_calibration(said(INVERSE, METRIC), TRUTH).ambiguities
     )
-    sized = Distances(TRUTH.mask, TRUTH.z, metres=2.0)
+    sized = DepthTruth(TRUTH.mask, TRUTH.z, metres=2.0)
     plain = Depth().after_calibration(said(INVERSE, METRIC), sized)
     assert not plain.ambiguities and plain.remarks == (
         "The model's numbers are read as metric depth: the distance in metres.",
@@ -198,7 +200,7 @@ def test_the_gradient_agrees_with_differences() -> None:
     """Of every objective, in float64, along a direction."""
     generator = torch.Generator().manual_seed(0)
     at, way = (torch.randn((HIGH, WIDE), generator=generator, dtype=torch.float64) for _ in range(2))
-    truth = Distances(MASK, TRUTH.z.double())
+    truth = DepthTruth(MASK, TRUTH.z.double())
     for kind in (DISPARITY, RELATIVE, METRIC):
         start = (said(INVERSE.double(), kind)[0][kind] + 0.02 * at).requires_grad_()
         for seek in ("", "nearer", "farther", "gone"):
@@ -216,7 +218,7 @@ def test_the_gradient_agrees_with_differences() -> None:
 
 def test_it_is_compared_with_the_distance_along_the_axis() -> None:
     sight = Sight(MASK, 2.0 * TRUTH.z, TRUTH.z)
-    truth = TASK.truth(Facts("mug", look=lambda: sight))
+    truth = TASK.truth(Facts("mug", compute_sight=lambda: sight))
     assert torch.equal(truth.z, TRUTH.z) and TASK.truth_names(truth) == (AS_FAR,)
     for kind in (DISPARITY, RELATIVE, METRIC):
         true, right = TASK.marks(said(moved(2.0), kind), truth)[0]
@@ -266,7 +268,7 @@ def test_a_search_verifies_and_draws(asked: list[str], capsys: pytest.CaptureFix
     flags = ["--epsilon", "0.5", "--steps", "12", "--objective", "gone", "--no-baseline", "--run", str(run)]
     found = answer(capsys, "attack", *asked, *SHORT, *flags)
     assert found["ending"] == "found" and found["clean"]["label"] == AS_FAR and found["clean"]["correct"]
-    assert found["verified"]["labels"] == {GONE: 6} and found["adversarial"]["payload"]["relief"] < 0.5
+    assert found["verified"]["labels"] == {AS_BACKGROUND: 6} and found["adversarial"]["payload"]["relief"] < 0.5
     with Store(run / "results.sqlite", read_only=True) as store:
         payloads: list[Any] = [row.payload for row in store.rows("verification")]
     assert {one["fitted"] for one in payloads} == {"beside the object"}
@@ -277,7 +279,7 @@ def test_a_search_verifies_and_draws(asked: list[str], capsys: pytest.CaptureFix
     off = [float(abs(one[:, 512:1024] - one[:, 1024:]).mean()) for one in (clean, drawn)]
     assert off[0] < 0.16 and off[1] > off[0] + 0.1, off
     page = (run / "report.html").read_text("utf-8")
-    assert f"The model judges this mug {GONE} in 6 of 6 fresh renders" in page
+    assert f"The model judges this mug {AS_BACKGROUND} in 6 of 6 fresh renders" in page
     assert "orange the object&#x27;s pixels whose distance is right." in page
 
 
@@ -313,8 +315,8 @@ def test_the_bundled_ground_says_the_scale() -> None:
     scene = advsearch.load_scene("mug")
     render = scene.renderer(["pose"], resolution=24)
     seen = render.surfaces(render.start)
-    truth = Distances(seen.seen("object"), seen.z_depth)
-    assert truth.anchored and int(truth.beside.sum()) > 100
+    truth = DepthTruth(seen.visible_mask("object"), seen.z_depth)
+    assert truth.determines_scale and int(truth.outside_object.sum()) > 100
     margins = [float(TASK.loss(said(one.reciprocal()), truth)) for one in (seen.z_depth, seen.depth)]
     assert margins[0] == pytest.approx(-math.log(1.25), abs=1e-5) and margins[1] > margins[0] + 1e-3
 

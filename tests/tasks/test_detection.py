@@ -15,14 +15,21 @@ from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model
 from advsearch.options import NOT_A_NUMBER, Outcome, get_outcome
 from advsearch.tasks import Detection, Facts, Judgement, Prediction, Sight
-from advsearch.tasks.boxes import Place, corners, left_over, log_odds, overlap, share_inside
+from advsearch.tasks.boxes import (
+    DetectionTruth,
+    compute_fraction_inside,
+    compute_iou,
+    compute_log_odds,
+    suppress_class,
+    to_corners,
+)
 from advsearch.tasks.detection import GOALS
-from advsearch.tasks.detector_outputs import detections_in
+from advsearch.tasks.detector_outputs import read_detections
 
 NAMES = ("cup", "bowl", "dog")
 HERE, NEAR, AWAY = [0.2, 0.2, 0.6, 0.6], [0.3, 0.2, 0.7, 0.6], [0.7, 0.7, 0.9, 0.9]
 TASK = Detection(labels=NAMES, unit="fractions")
-TRUTH = Place((0,), (4, 4, 12, 12), (20, 20))
+TRUTH = DetectionTruth((0,), (4, 4, 12, 12), (20, 20))
 """The object is where `HERE` says; `NEAR` overlaps it by 0.6."""
 
 
@@ -38,7 +45,7 @@ def sparse(*rows: tuple[list[float], int, float]) -> list[dict[str, Tensor]]:
     return [{"boxes": boxes, "labels": labels, "scores": scores}]
 
 
-def judged(task: Detection, output: list[dict[str, Tensor]], truth: Place = TRUTH) -> Judgement:
+def judged(task: Detection, output: list[dict[str, Tensor]], truth: DetectionTruth = TRUTH) -> Judgement:
     (found,) = task.judge(output, truth)
     assert found.score == pytest.approx(float(task.score(output, truth)))
     assert found.margin == pytest.approx(-float(task.loss(output, truth)))
@@ -51,20 +58,20 @@ def judged(task: Detection, output: list[dict[str, Tensor]], truth: Place = TRUT
 def test_boxes_overlap_by_the_share_of_their_union() -> None:
     box = torch.tensor(HERE)
     boxes = torch.tensor([HERE, NEAR, AWAY, [0.2, 0.2, 0.4, 0.6], [0.6, 0.6, 0.2, 0.2]])
-    assert overlap(boxes, box).tolist() == pytest.approx([1.0, 0.6, 0.0, 0.5, 0.0], abs=1e-5)
-    assert share_inside(boxes, box).tolist() == pytest.approx([1.0, 0.75, 0.0, 1.0, 0.0], abs=1e-5)
+    assert compute_iou(boxes, box).tolist() == pytest.approx([1.0, 0.6, 0.0, 0.5, 0.0], abs=1e-5)
+    assert compute_fraction_inside(boxes, box).tolist() == pytest.approx([1.0, 0.75, 0.0, 1.0, 0.0], abs=1e-5)
 
 
 def test_all_forms_of_a_box_are_the_same_corners() -> None:
     forms = {"xyxy": [1, 2, 5, 8], "xywh": [1, 2, 4, 6], "cxcywh": [3, 5, 4, 6], "yxyx": [2, 1, 8, 5]}
     for form, numbers in forms.items():
-        assert corners(torch.tensor(numbers).float(), form).tolist() == [1, 2, 5, 8]
+        assert to_corners(torch.tensor(numbers).float(), form).tolist() == [1, 2, 5, 8]
 
 
 def test_of_boxes_that_overlap_the_best_one_is_left() -> None:
     boxes, scores = torch.tensor([HERE, NEAR, AWAY]), torch.tensor([0.5, 0.9, 0.6])
-    assert left_over(boxes, scores, 0.5).tolist() == [False, True, True]
-    assert left_over(boxes, scores, 0.7).all()
+    assert suppress_class(boxes, scores, 0.5).tolist() == [False, True, True]
+    assert suppress_class(boxes, scores, 0.7).all()
 
 
 # ---- what a detector returns ----------------------------------------------------------------------------------------
@@ -91,7 +98,7 @@ class Output:
     ],
 )
 def test_scores_of_all_classes_are_read_in_every_form(answer: Any) -> None:
-    found = detections_in(answer, 2)
+    found = read_detections(answer, 2)
     assert [sorted(one) for one in found] == [["boxes", "scores"]] * 2
     for k, one in enumerate(found):
         assert one["boxes"].equal(BOXES[k]) and one["scores"].equal(SCORES[k])
@@ -108,14 +115,14 @@ def test_scores_of_all_classes_are_read_in_every_form(answer: Any) -> None:
     ],
 )
 def test_one_label_a_box_is_read_in_every_form(answer: Any) -> None:
-    for k, one in enumerate(detections_in(answer, 2)):
+    for k, one in enumerate(read_detections(answer, 2)):
         assert one["boxes"].equal(BOXES[k]) and one["labels"].equal(LABELS[k]) and one["scores"].equal(ONE[k])
 
 
 def test_one_picture_may_come_without_its_dimension_and_none_may_be_found() -> None:
-    (one,) = detections_in((BOXES[0], LABELS[0], ONE[0]), 1)
+    (one,) = read_detections((BOXES[0], LABELS[0], ONE[0]), 1)
     assert one["labels"].equal(LABELS[0])
-    first, second = detections_in([*sparse((HERE, 1, 0.5)), *sparse()], 2)
+    first, second = read_detections([*sparse((HERE, 1, 0.5)), *sparse()], 2)
     assert len(first["scores"]) == 1 and second["boxes"].shape == (0, 4)
 
 
@@ -134,7 +141,7 @@ def test_one_picture_may_come_without_its_dimension_and_none_may_be_found() -> N
 )
 def test_what_is_no_detection_is_refused(answer: Any, text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        detections_in(answer, 2)
+        read_detections(answer, 2)
 
 
 # ---- suppression ----------------------------------------------------------------------------------------------------
@@ -259,7 +266,7 @@ def test_what_is_found_where_the_object_is_not_visible_is_a_phantom() -> None:
 
 
 def test_a_loose_box_of_the_object_creates_nothing() -> None:
-    task = TASK.seeking("create")
+    task = TASK.with_objective("create")
     beside = [0.45, 0.2, 0.85, 0.6]  # of it less than half is on the object, which it overlaps by .23
     assert not judged(task, dense((beside, [0.9, 0.0, 0.0]))).success
     assert judged(task, dense((beside, [0.0, 0.0, 0.9]))).success, "a dog is no loose cup"
@@ -275,7 +282,7 @@ def test_the_margin_is_in_log_odds_of_the_score_that_counts() -> None:
 
 
 def test_several_names_may_be_right() -> None:
-    either = Place((0, 1), TRUTH.box, TRUTH.size)
+    either = DetectionTruth((0, 1), TRUTH.box, TRUTH.size)
     found = judged(TASK, dense((HERE, [0.2, 0.7, 0.6])), either)
     assert found.right and found.prediction.label == "bowl" and TASK.truth_names(either) == ("cup", "bowl")
 
@@ -301,7 +308,7 @@ def test_several_names_may_be_right() -> None:
     ],
 )
 def test_an_objective_says_what_is_a_success(seek: str, output: list[dict[str, Tensor]], success: bool) -> None:
-    task = TASK.seeking(seek)
+    task = TASK.with_objective(seek)
     assert task.seek == seek and judged(task, output).success is success
     assert (
         get_objective(seek, task)(output, torch.zeros(1, 4, 4, 3), TRUTH).tolist() == task.score(output, TRUTH).tolist()
@@ -309,7 +316,7 @@ def test_an_objective_says_what_is_a_success(seek: str, output: list[dict[str, T
 
 
 def test_what_is_created_is_wrong_and_named() -> None:
-    task = TASK.seeking("create")
+    task = TASK.with_objective("create")
     ghost = dense((HERE, [0.8, 0.0, 0.0]), (AWAY, [0.0, 0.0, 0.6]))
     assert (judged(task, ghost).right, judged(task, ghost).prediction.label) == (False, "dog elsewhere")
     assert (judged(task, FOUND).right, judged(task, FOUND).prediction.label) == (True, "cup")
@@ -335,11 +342,11 @@ def test_easier_is_the_opposite_of_vanishing() -> None:
 
 
 def test_where_nothing_of_the_object_is_seen_nothing_is_missed() -> None:
-    hidden = Place((0,), None, (20, 20))
+    hidden = DetectionTruth((0,), None, (20, 20))
     for seek in ("vanish", "mislabel", "displace"):
-        found = judged(TASK.seeking(seek), FOUND, hidden)
+        found = judged(TASK.with_objective(seek), FOUND, hidden)
         assert found.right and not found.success and found.prediction == Prediction("out of view")
-    assert judged(TASK.seeking("create"), dense((HERE, [0.0, 0.7, 0.0])), hidden).success
+    assert judged(TASK.with_objective("create"), dense((HERE, [0.0, 0.7, 0.0])), hidden).success
 
 
 def test_a_score_that_is_no_number_is_neither_right_nor_a_success() -> None:
@@ -355,18 +362,18 @@ def judged_anyway(output: list[dict[str, Tensor]]) -> Judgement:
 def test_every_objective_has_a_derivative(seek: str) -> None:
     boxes = torch.tensor([[0.22, 0.2, 0.6, 0.6], NEAR, AWAY], requires_grad=True)
     scores = torch.tensor([[0.7, 0.2, 0.1], [0.6, 0.3, 0.1], [0.2, 0.3, 0.4]], requires_grad=True)
-    value = TASK.seeking(seek).score([{"boxes": boxes, "scores": scores}], TRUTH).sum()
+    value = TASK.with_objective(seek).score([{"boxes": boxes, "scores": scores}], TRUTH).sum()
     found = torch.autograd.grad(value, [boxes, scores], allow_unused=True)
     moved = [one is not None and bool(one.abs().sum() > 0.0) for one in found]
     assert moved == ([True, False] if seek == "displace" else [False, True])
     empty = sparse()
     empty[0]["scores"].requires_grad_()
-    torch.autograd.grad(TASK.seeking(seek).score(empty, TRUTH).sum(), empty[0]["scores"])
+    torch.autograd.grad(TASK.with_objective(seek).score(empty, TRUTH).sum(), empty[0]["scores"])
 
 
 def test_log_odds_are_finite_everywhere() -> None:
     ends = torch.tensor([0.0, 0.5, 1.0, -0.1, 1.1])
-    assert bool(log_odds(ends).isfinite().all()) and log_odds(ends)[1] == 0.0
+    assert bool(compute_log_odds(ends).isfinite().all()) and compute_log_odds(ends)[1] == 0.0
 
 
 def test_the_payload_has_all_boxes_in_pixels_and_marks_show_those_that_count() -> None:
@@ -405,12 +412,12 @@ def test_a_task_learns_names_size_and_unit_from_its_model() -> None:
     assert (task.labels, task.named, task.inferred_unit, task.input_size) == (NAMES, True, "pixels", (8, 16))
     assert model.differentiable
     output = model(torch.full((8, 16, 3), 0.9))
-    at = Place((0,), (4, 8, 12, 24), (32, 32))
+    at = DetectionTruth((0,), (4, 8, 12, 24), (32, 32))
     assert task.judge(output, at)[0].right, "2 to 6 of 16 are 4 to 12 of 32"
     unnamed = Detection(unit="fractions").on(load_model(Pixels(), input_size=(8, 16), read=Detection().reader))
     assert unnamed.labels == ("class 0", "class 1", "class 2") and unnamed.unit == "fractions"
-    facts = Facts("mug", "#2", look=lambda: Sight(torch.ones(4, 4).bool(), torch.ones(4, 4), torch.ones(4, 4)))
-    assert unnamed.truth(facts) == Place((2,), (0, 0, 4, 4), (4, 4))
+    facts = Facts("mug", "#2", compute_sight=lambda: Sight(torch.ones(4, 4).bool(), torch.ones(4, 4), torch.ones(4, 4)))
+    assert unnamed.truth(facts) == DetectionTruth((2,), (0, 0, 4, 4), (4, 4))
     assert Detection().on(load_model(replace(model, labels=()), labels=NAMES)).labels == NAMES, "named afterwards"
     with pytest.raises(InputError, match="labels: 2 labels, but model Pixels has 3 classes"):
         Detection().on(replace(model, labels=("a", "b")))

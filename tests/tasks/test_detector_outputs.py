@@ -16,15 +16,15 @@ from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.options import NOT_A_NUMBER
 from advsearch.tasks import Detection, Prediction
-from advsearch.tasks.boxes import Detections, Place
-from advsearch.tasks.detector_outputs import detections_in, settled
+from advsearch.tasks.boxes import Detections, DetectionTruth
+from advsearch.tasks.detector_outputs import read_detections, resolve_detections
 
 CUP, BOWL = [20.0, 40.0, 60.0, 90.0], [65.0, 10.0, 90.0, 35.0]
 NAMES = ("cup", "bowl")
 PICTURE = torch.full((100, 100, 3), 0.25)
 """In which the detectors below find something, and nothing in brighter ones."""
 
-TRUTH = Place((0,), (20, 40, 60, 90), (100, 100))
+TRUTH = DetectionTruth((0,), (20, 40, 60, 90), (100, 100))
 NAN = math.nan
 
 Rows = tuple[Tensor, Tensor, Tensor]
@@ -144,10 +144,10 @@ def test_a_silent_model_leaves_all_open() -> None:
 
 
 def test_an_order_says_what_is_what() -> None:
-    first = detections_in(rows(*three(), "csb"), 1, "labels scores boxes")[0]
+    first = read_detections(rows(*three(), "csb"), 1, "labels scores boxes")[0]
     assert first["boxes"].tolist() == [CUP, BOWL] and first["labels"].tolist() == [0, 1]
     boxes, scores, classes = three()
-    (second,) = detections_in((classes, scores, boxes), 1, "labels, scores, boxes")
+    (second,) = read_detections((classes, scores, boxes), 1, "labels, scores, boxes")
     assert second["scores"].tolist() == pytest.approx([0.8, 0.6])
     with pytest.raises(InputError, match="order: expected boxes, scores and labels in their order"):
         Detection(order="scores boxes")
@@ -170,7 +170,7 @@ def three() -> Rows:
 )
 def test_what_cannot_be_a_score_and_a_class_is_refused(answer: Callable[..., Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        settled(detections_in(answer(*three()), 1)[0])
+        resolve_detections(read_detections(answer(*three()), 1)[0])
 
 
 # ---- unit and form --------------------------------------------------------------------------------------------------
@@ -227,7 +227,7 @@ def test_background_is_no_prediction_wherever_it_stands(name: str, place: int) -
     labels.insert(place, name)
     scores.insert(place, 0.9)
     task = Detection(labels=tuple(labels), unit="fractions", seek="mislabel")
-    truth = Place((labels.index("cup"),), (20, 40, 60, 90), (100, 100))
+    truth = DetectionTruth((labels.index("cup"),), (20, 40, 60, 90), (100, 100))
     box = torch.tensor([[0.2, 0.4, 0.6, 0.9]])
     named = [{"boxes": box, "labels": torch.tensor([place]), "scores": torch.tensor([0.9])}]
     for output in (dense(scores), named):
@@ -235,10 +235,10 @@ def test_background_is_no_prediction_wherever_it_stands(name: str, place: int) -
         assert not found.success and found.prediction.label == "no cup"
         assert isinstance(found.payload, dict) and f'"{name}"' not in json.dumps(found.payload["found"])
         assert all(one.label != name for one in task.predictions(output, 5)[0])
-        hidden = Place(truth.labels, None, (100, 100))
-        assert not task.seeking("create").judge(output, hidden)[0].success
+        hidden = DetectionTruth(truth.labels, None, (100, 100))
+        assert not task.with_objective("create").judge(output, hidden)[0].success
     honest = Detection(labels=("cup", "none of the above"), unit="fractions", seek="mislabel")
-    assert honest.judge(dense([0.1, 0.9]), Place((0,), truth.box, truth.size))[0].success
+    assert honest.judge(dense([0.1, 0.9]), DetectionTruth((0,), truth.box, truth.size))[0].success
 
 
 @pytest.mark.parametrize(
@@ -258,5 +258,5 @@ def test_what_is_not_a_number_is_called_that_and_what_fills_up_is_left_out(one: 
     output = task.read([{name: torch.tensor(part) for name, part in one.items()}], 1)
     (found,) = task.judge(output, TRUTH)
     assert found.prediction.label == label and found.right is (label == "cup") and not found.success
-    assert found.not_a_number is (label == NOT_A_NUMBER) is math.isnan(found.margin)
+    assert found.is_not_a_number is (label == NOT_A_NUMBER) is math.isnan(found.margin)
     assert task.predictions(output)[0][0].label == label

@@ -14,12 +14,12 @@ from advsearch import load_model
 from advsearch.errors import InputError, ModelError
 from advsearch.models.labels import read_labels
 from advsearch.tasks import Detection
-from advsearch.tasks.boxes import Place
+from advsearch.tasks.boxes import DetectionTruth
 from advsearch.tasks.detector_outputs import QUERIES
 
 NAMES = ("bowl", "coffee mug", "dog")
 ALONE, CHOSEN = QUERIES
-TRUTH = Place((1,), (2, 2, 30, 30), (32, 32))
+TRUTH = DetectionTruth((1,), (2, 2, 30, 30), (32, 32))
 
 
 class Bright(nn.Module):

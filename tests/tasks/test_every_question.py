@@ -16,7 +16,7 @@ from torch import nn
 import advsearch
 from advsearch.cli.main import main
 from advsearch.questions.photographs.carry_out import Photographs
-from advsearch.questions.photographs.result import rendering_file
+from advsearch.questions.photographs.result import find_rendering
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Detection
@@ -58,7 +58,7 @@ def task_of(asked: list[str]) -> str:
 
 def photographed(taker: Photographs, run: Path, name: str, shift: int = 0) -> list[bool]:
     """Whether the model is right on the rendering, and on a photograph that shows it further to the right by pixels."""
-    with Image.open(rendering_file(run, name)) as image, io.BytesIO() as sent:
+    with Image.open(find_rendering(run, name)) as image, io.BytesIO() as sent:
         Image.fromarray(np.roll(np.asarray(image), shift, axis=1)).save(sent, "PNG")
         taker.add(run, name, sent.getvalue())
     with Store(run / "results.sqlite", read_only=True) as store:

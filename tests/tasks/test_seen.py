@@ -20,8 +20,8 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.attacks import Query
 from advsearch.cli.main import main
-from advsearch.engine.journal import Journal, Shared
-from advsearch.engine.record import judgement_of, trial_row
+from advsearch.engine.journal import Journal, ParallelEvaluator
+from advsearch.engine.record import make_trial_row, read_judgement
 from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.runs.directory import RunDirectory
@@ -63,7 +63,7 @@ class Middle(nn.Module):
 
 def seen(rows: list[list[int]]) -> Facts:
     there = torch.tensor(rows)
-    return Facts("mug", look=lambda: Sight(there.bool(), there.float(), there.float()))
+    return Facts("mug", compute_sight=lambda: Sight(there.bool(), there.float(), there.float()))
 
 
 def test_a_box_holds_what_is_seen() -> None:
@@ -71,7 +71,7 @@ def test_a_box_holds_what_is_seen() -> None:
     assert facts.mask.dtype == torch.bool and facts.box == (1, 1, 3, 3)
     assert seen([[1, 0], [0, 1]]).box == (0, 0, 2, 2)
     assert seen([[0, 0]]).box is None
-    assert Facts("mug", look=lambda: pytest.fail("nobody asked")).numbers == {}
+    assert Facts("mug", compute_sight=lambda: pytest.fail("nobody asked")).numbers == {}
 
 
 def test_without_a_configuration_there_is_nothing_to_see() -> None:
@@ -82,7 +82,7 @@ def test_without_a_configuration_there_is_nothing_to_see() -> None:
 
 def test_the_camera_looks_once_for_all_that_is_seen() -> None:
     looks = iter([Sight(torch.ones(2, 2).bool(), torch.full((2, 2), 3.0), torch.full((2, 2), 2.5))])
-    facts = Facts("mug", look=lambda: next(looks))
+    facts = Facts("mug", compute_sight=lambda: next(looks))
     assert facts.box == (0, 0, 2, 2) and facts.depth.tolist() == [[3.0, 3.0]] * 2 and bool(facts.mask.all())
 
 
@@ -93,17 +93,17 @@ KEPT = {"boxes": [[1, 2.5, 3, 4]], "words": ["a, b", 'c"d', None], "deep": {"er"
 def test_a_payload_comes_back_from_the_rows_of_searches_and_trials(tmp_path: Path, payload: Any) -> None:
     judgement = Judgement(1.0, 1.0, False, Prediction("here"), payload)
     with RunDirectory.create(tmp_path / "run") as run:
-        run.record(trial_row("sweep", 0, 7, 1, judgement), Row("sweep", 1))
+        run.record(make_trial_row("sweep", 0, 7, 1, judgement), Row("sweep", 1))
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
         row, without = store.rows()
     assert row.payload == plain(payload) and without.payload is None
-    assert judgement_of(row) == Judgement(1.0, 1.0, False, Prediction("here"), plain(payload))
+    assert read_judgement(row) == Judgement(1.0, 1.0, False, Prediction("here"), plain(payload))
     with RunDirectory.resume(tmp_path / "run") as run:
         problem: Any = None
-        (answer,) = Journal(run, Shared(problem)).evaluate_all(
+        (answer,) = Journal(run, ParallelEvaluator(problem)).evaluate_all(
             [Query(torch.zeros(1), 0, "sweep", 0)], lambda queries: []
         )
-        assert answer.said == judgement_of(row), "it is read back, and nothing is asked"
+        assert answer.required_judgement == read_judgement(row), "it is read back, and nothing is asked"
 
 
 @pytest.fixture(scope="module")
@@ -186,11 +186,11 @@ def test_a_depth_is_judged_by_the_one_of_each_configuration(tmp_path: Path) -> N
         rows = list(store.rows("sweep"))
     renderer = advsearch.load_scene("banana").renderer({"pose": {"yaw": [0.0, 90.0]}}, resolution=24)
     surfaces = [renderer.surfaces(torch.tensor([u])) for u in (0.0, 1.0)]
-    offs = [(2.0 / one.depth[one.seen("object")]).log() for one in surfaces]
+    offs = [(2.0 / one.depth[one.visible_mask("object")]).log() for one in surfaces]
     expected = [float((off - off.mean()).abs().mean()) - math.log(1.05) for off in offs]
     expected = [-loss for loss in expected]
     assert [row.margin for row in rows] == pytest.approx(expected, abs=1e-4) and expected[0] != expected[1]
-    distances = torch.cat([one.depth[one.seen("object")] for one in surfaces])
+    distances = torch.cat([one.depth[one.visible_mask("object")] for one in surfaces])
     assert 0.1 < float(distances.min()) < float(distances.max()) < 1.0, "metres"
     attack: dict[str, Any] = {
         "controls": ["pose"],

@@ -15,12 +15,12 @@ from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
 from advsearch.options import NOT_A_NUMBER
 from advsearch.tasks import Facts, Prediction, Sight
-from advsearch.tasks.segmentation import Region, Segmentation
+from advsearch.tasks.segmentation import Segmentation, SegmentationTruth
 
 NAMES = ("background", "bottle", "chair")
 TASK = Segmentation(labels=NAMES)
 MASK = torch.tensor([[0, 1, 1, 0], [0, 1, 1, 0]]).bool()
-TRUTH = Region((1,), MASK)
+TRUTH = SegmentationTruth((1,), MASK)
 
 
 def of(*classes: list[int], sure: float = 2.0) -> Tensor:
@@ -92,9 +92,9 @@ def test_a_target_has_to_get_enough_of_the_pixels() -> None:
 
 def test_where_nothing_of_the_object_is_seen_nothing_is_wrong() -> None:
     output = QUARTER.clone().requires_grad_()
-    (found,) = TASK.judge(output, Region((1,), torch.zeros_like(MASK)))
+    (found,) = TASK.judge(output, SegmentationTruth((1,), torch.zeros_like(MASK)))
     assert found.right and found.prediction == Prediction("out of view") and found.payload is None
-    assert TASK.pixel_margin(output, Region((1,), torch.zeros_like(MASK))).requires_grad
+    assert TASK.pixel_margin(output, SegmentationTruth((1,), torch.zeros_like(MASK))).requires_grad
 
 
 def test_logits_that_are_no_numbers_are_not_right() -> None:
@@ -104,11 +104,13 @@ def test_logits_that_are_no_numbers_are_not_right() -> None:
 
 def test_a_mask_follows_the_size_of_the_output() -> None:
     fine = MASK.repeat_interleave(3, dim=0).repeat_interleave(3, dim=1)
-    assert Region((1,), fine).at((2, 4)).equal(MASK) and TRUTH.at((6, 12)).equal(fine)
+    assert SegmentationTruth((1,), fine).resize_mask((2, 4)).equal(MASK) and TRUTH.resize_mask((6, 12)).equal(fine)
     small = torch.zeros(8, 8).bool()
     small[1, 1] = True
-    assert int(Region((1,), small).at((2, 2)).sum()) == 1, "an object that is smaller than a pixel is still seen"
-    assert TASK.judge(ALL, Region((1,), fine))[0].right
+    assert int(SegmentationTruth((1,), small).resize_mask((2, 2)).sum()) == 1, (
+        "an object that is smaller than a pixel is still seen"
+    )
+    assert TASK.judge(ALL, SegmentationTruth((1,), fine))[0].right
 
 
 def test_predictions_are_the_classes_of_most_pixels() -> None:
@@ -151,7 +153,9 @@ def test_a_task_learns_names_from_its_model() -> None:
     model = load_model(Mapped(), input_size=4, read=Segmentation().reader, labels=NAMES)
     task = Segmentation().on(model, target="chair")
     assert (task.labels, task.target) == (NAMES, (2,)) and model.differentiable
-    facts = Facts("bottle", None, "bottle", look=lambda: Sight(MASK, torch.ones(MASK.shape), torch.ones(MASK.shape)))
+    facts = Facts(
+        "bottle", None, "bottle", compute_sight=lambda: Sight(MASK, torch.ones(MASK.shape), torch.ones(MASK.shape))
+    )
     truth = task.truth(facts)
     assert truth.labels == TRUTH.labels and torch.equal(truth.mask, TRUTH.mask)
     assert task.truth_names(TRUTH) == ("bottle",)
@@ -184,7 +188,7 @@ def test_pixels_that_are_not_numbers_are_no_output() -> None:
         (found,) = TASK.judge(output, TRUTH)
         assert (
             found.prediction == Prediction(NOT_A_NUMBER)
-            and found.not_a_number
+            and found.is_not_a_number
             and not found.right
             and not found.success
         )

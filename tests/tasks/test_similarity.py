@@ -22,7 +22,7 @@ from advsearch.models import Model, ModelWarning
 from advsearch.runs.files import read_png, to_8bit
 from advsearch.runs.summary import file_digests
 from advsearch.tasks import Facts, make_task
-from advsearch.tasks.similarity import ELSE, ITSELF, TEMPERATURE, Similarity
+from advsearch.tasks.similarity import ITSELF, SOMETHING_ELSE, TEMPERATURE, Similarity
 from small_models import SIDE
 
 COLOURS = {"blue": (0.2, 0.3, 0.9), "green": (0.2, 0.8, 0.3), "red": (0.9, 0.2, 0.2)}
@@ -176,7 +176,7 @@ def test_logits_are_the_mean_cosine_of_the_nearest_of_each_name(folder: Path, mo
     for name in NAMES:
         cosines = features(model, asked) @ features(model, own_pictures(folder, name)).T
         expected.append(cosines.sort(dim=1, descending=True).values[:, :k].mean(dim=1))
-    logits = task.logits(model(asked))
+    logits = task.compute_logits(model(asked))
     torch.testing.assert_close(logits, torch.stack(expected, dim=1) / TEMPERATURE)
     assert task.labels == NAMES and logits.argmax(dim=1).tolist() == [0, 1, 2]
     assert [first.label for first, *_ in task.predictions(model(asked), 2)] == list(NAMES)
@@ -188,14 +188,14 @@ def test_a_linear_head_is_the_minimum_of_its_loss_and_the_same_each_time(folder:
     assert task.gallery and task.gallery.head and again.gallery and again.gallery.head
     assert all(torch.equal(*both) for both in zip(task.gallery.head, again.gallery.head, strict=True))
     weights, biases = (one.double().requires_grad_() for one in task.gallery.head)
-    given, owners = task.gallery.features.double(), task.gallery.owners
+    given, owners = task.gallery.features.double(), task.gallery.name_index
     shares = torch.stack([1.0 / (3 * (owners == one).sum()) for one in owners])
     each = nn.functional.cross_entropy(given @ weights.T + biases, owners, reduction="none")
     loss = (shares * each).sum() + 5e-4 * weights.square().sum()
     slopes = torch.autograd.grad(loss, (weights, biases))
     assert max(float(one.abs().max()) for one in slopes) < 1e-5
     asked = torch.stack([noisy(colour, 98) for colour in COLOURS.values()])
-    assert task.logits(model(asked)).argmax(dim=1).tolist() == [0, 1, 2]
+    assert task.compute_logits(model(asked)).argmax(dim=1).tolist() == [0, 1, 2]
 
 
 def test_references_are_turned_upright_and_cut_to_the_shape_of_the_input(tmp_path: Path, model: Model) -> None:
@@ -216,21 +216,21 @@ def test_a_judgement_says_where_the_right_one_stands(folder: Path, model: Model)
     truth = task.truth(Facts("mug", label="blue"))
     right, wrong = task.judge(model(torch.stack([blue, green])), truth)
     assert task.gallery is not None
-    cosines = task.gallery.cosines(features(model, green[None]))[0]
-    own = cosines[task.gallery.owners == 0].max()
+    cosines = task.gallery.compute_cosines(features(model, green[None]))[0]
+    own = cosines[task.gallery.name_index == 0].max()
     assert right.right and right.payload["rank"] == right.payload["name_rank"] == 1  # type: ignore[index, call-overload]
     assert not wrong.right and wrong.prediction.label == "green"
     assert wrong.payload == {
         "rank": 1 + int((cosines > own).sum()),
         "references": 11,
         "cosine": round(float(own), 4),
-        "name_rank": 2 if float(own) > float(cosines[task.gallery.owners == 2].max()) else 3,
+        "name_rank": 2 if float(own) > float(cosines[task.gallery.name_index == 2].max()) else 3,
         "nearest": task.gallery.paths[int(cosines.argmax())],
         "nearest_cosine": round(float(cosines.max()), 4),
     }
     assert 1 < wrong.payload["rank"] <= 8  # type: ignore[operator]
     (broken,) = task.judge(torch.full((1, 12), torch.nan), truth)
-    assert broken.not_a_number and broken.payload is None
+    assert broken.is_not_a_number and broken.payload is None
 
 
 @pytest.mark.parametrize(
@@ -258,7 +258,7 @@ def test_objectives_of_logits_have_a_true_gradient(
 def test_a_threshold_compares_with_the_clean_picture(model: Model) -> None:
     task = Similarity(threshold=0.8).on(model)
     clean, other = noisy(COLOURS["red"], 1), noisy(COLOURS["blue"], 1)
-    assert task.calibrates and task.truth(Facts("mug", own_label="mug")) == (0,)
+    assert task.calibrates and task.truth(Facts("mug", object_label="mug")) == (0,)
     with pytest.raises(InputError, match="a clean picture that it was shown first"):
         task.judge(model(clean), (0,))
     task = task.after_calibration(model(clean), (0,))
@@ -266,7 +266,7 @@ def test_a_threshold_compares_with_the_clean_picture(model: Model) -> None:
     same, different = task.judge(model(torch.stack([clean, other])), (0,))
     assert same.right and same.prediction.label == ITSELF and same.payload == {"cosine": 1.0}
     assert same.margin == pytest.approx((1.0 - 0.8) / TEMPERATURE, rel=1e-3)
-    assert not different.right and different.prediction.label == ELSE
+    assert not different.right and different.prediction.label == SOMETHING_ELSE
 
 
 def test_the_distance_is_one_minus_the_cosine_and_leads_away_from_the_start(model: Model) -> None:
@@ -348,7 +348,7 @@ def test_a_sweep_counts_what_is_not_itself_any_more(
     flags += ["--grid", "camera.azimuth=40,220", "--spp", "2", "--denoise", "none"]
     found = typed(capsys, "sweep", "--object", "mug", *flags, "--run", str(tmp_path / "run"))
     assert (found["configurations"], found["correct"]) == (2, 1)
-    assert found["worst"]["claimed"]["label"] == ELSE and found["worst"]["claimed"]["payload"]["cosine"] < 0.9
+    assert found["worst"]["claimed"]["label"] == SOMETHING_ELSE and found["worst"]["claimed"]["payload"]["cosine"] < 0.9
 
 
 # ---- wrong uses -----------------------------------------------------------------------------------------------------
@@ -389,7 +389,7 @@ def test_names_that_are_not_there_are_refused_with_those_that_are(folder: Path, 
     with pytest.raises(InputError, match=r"label: .* no label 'blu'. Did you mean 'blue' \(#0\)"):
         task.check(Facts("mug", label="blu"))
     with pytest.raises(InputError, match=r"label: the label of mug itself does not fit .* blue, green, red"):
-        task.check(Facts("mug", own_label="mug"))
+        task.check(Facts("mug", object_label="mug"))
     with pytest.raises(InputError, match=r"target: .* no label 'pink'"):
         Similarity(references=str(folder)).on(model, target="pink")
     with pytest.raises(InputError, match="labels: the names of task similarity are those of its folders"):

@@ -20,12 +20,12 @@ from advsearch.cli.main import main
 from advsearch.config import CONFIGS
 from advsearch.errors import InputError, ModelError, UnknownNameError
 from advsearch.models import load_model
-from advsearch.options import as_setting
+from advsearch.options import to_setting
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.tasks import TASKS, Classification, Facts, Judgement, Prediction, Task, make_task
-from advsearch.tasks.base import typical
-from advsearch.tasks.together import Together
+from advsearch.tasks.base import most_frequent_judgement
+from advsearch.tasks.together import EnsembleTask
 
 LOGITS = torch.tensor([[3.0, 1.0, 0.0], [0.0, 2.0, 1.0], [0.0, 1.0, 4.0], [2.0, 2.0, 0.0], [math.nan, 0.0, 1.0]])
 NAMED = Classification(labels=("mug", "bowl", "vase"))
@@ -88,7 +88,7 @@ def test_an_output_that_is_not_a_number_is_called_that(logits: list[float]) -> N
     output = torch.tensor([logits])
     for task in (NAMED, replace(NAMED, target=(2,)), replace(NAMED, minimise=True)):
         (found,) = task.judge(output, (0,))
-        assert found.prediction == Prediction("not a number", None, None) and found.not_a_number
+        assert found.prediction == Prediction("not a number", None, None) and found.is_not_a_number
         assert not found.right and not found.success and math.isnan(found.score) and math.isnan(found.margin)
     assert NAMED.predictions(output, 3) == [(Prediction("not a number"),)]
     (found,) = NAMED.judge(torch.tensor([[1.0, 0.0, -math.inf]]), (0,))
@@ -139,10 +139,10 @@ def test_the_typical_prediction_is_the_most_frequent_one() -> None:
     def said(margin: float, index: int, probability: float) -> Judgement:
         return Judgement(-margin, margin, margin >= 0.0, Prediction(f"class {index}", index, probability))
 
-    answer = typical((said(1.0, 7, 0.5), said(3.0, 7, 0.7), said(2.0, 3, 0.99)))
+    answer = most_frequent_judgement((said(1.0, 7, 0.5), said(3.0, 7, 0.7), said(2.0, 3, 0.99)))
     assert answer.prediction.index == 7
     assert (answer.margin, answer.prediction.probability) == pytest.approx((2.0, 0.6))
-    assert typical((said(1.0, 9, 0.1), said(1.0, 2, 0.3))).prediction.index == 2
+    assert most_frequent_judgement((said(1.0, 9, 0.1), said(1.0, 2, 0.3))).prediction.index == 2
 
 
 # ---- another task ---------------------------------------------------------------------------------------------------
@@ -177,7 +177,7 @@ class Level(nn.Module):
 
 
 def at(numbers: Mapping[str, float]) -> Facts:
-    return Facts("mug", describe=lambda: numbers)
+    return Facts("mug", describe_values=lambda: numbers)
 
 
 def test_three_methods_make_a_task() -> None:
@@ -217,7 +217,7 @@ def test_an_objective_of_another_task_is_refused() -> None:
     ):
         check_objective("margin", "yaw")
     without = {"answer", "command", "rig"}
-    assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {*TASKS, Together.name, None} - without
+    assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {*TASKS, EnsembleTask.name, None} - without
 
 
 def test_a_model_of_a_task_answers_with_what_the_task_reads() -> None:
@@ -273,7 +273,7 @@ def test_every_command_maximises_what_is_the_tasks_own(command: str, monkeypatch
     config: Any = CONFIGS[command]
     problem, _ = problem_from_config(config(object="mug", resolution=16, controls={"pose": {"yaw": [0, 90]}}))
     image = torch.full((16, 16, 3), 0.5)
-    assert float(problem.loss(image)) == pytest.approx(40.0), "50 for 0 degrees, of which 10 are tolerated"
+    assert float(problem.compute_loss(image)) == pytest.approx(40.0), "50 for 0 degrees, of which 10 are tolerated"
 
 
 def test_tasks_have_names() -> None:
@@ -307,8 +307,8 @@ def test_a_task_is_made_with_options(named: None) -> None:
 def test_options_are_shown_and_a_file_says_those_that_are_not_the_default(
     named: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert as_setting(Yaw(tolerance=5.0)) == {"name": "yaw", "tolerance": 5.0}
-    assert as_setting(Yaw()) == as_setting(Yaw(minimise=True, tolerance=math.inf)) == "yaw"
+    assert to_setting(Yaw(tolerance=5.0)) == {"name": "yaw", "tolerance": 5.0}
+    assert to_setting(Yaw()) == to_setting(Yaw(minimise=True, tolerance=math.inf)) == "yaw"
     assert main(["show", "task", "yaw", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["options"] == [{"name": "tolerance", "type": "float", "default": 10.0}]
     assert main(["show", "policy", "restarts"]) == 0

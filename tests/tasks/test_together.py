@@ -12,16 +12,16 @@ from torch import nn
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.engine.judging import objective_for
+from advsearch.engine.judging import make_objective
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Detection, Facts, Sight, Task, make_task
-from advsearch.tasks.depth import AS_FAR, DISPARITY, GONE, Depth
+from advsearch.tasks.depth import AS_BACKGROUND, AS_FAR, DISPARITY, Depth
 from advsearch.tasks.segmentation import Segmentation
-from advsearch.tasks.together import Together, together
+from advsearch.tasks.together import EnsembleTask, join_models
 from small_models import SIDE, Finder, Painter, Ranger
 
 BOTH = {"name": "detection+depth", "depth": {"kind": DISPARITY}}
@@ -58,7 +58,7 @@ def test_one_configuration_against_a_detector_and_a_model_of_depth(
         "--run", str(run), "--json",
     )  # fmt: skip
     assert found["ending"] == "found" and found["objective"] == "each" and found["task"] == "detection+depth"
-    assert found["clean"]["label"] == f"cup; {AS_FAR}" and found["verified"]["labels"] == {f"bowl; {GONE}": 6}
+    assert found["clean"]["label"] == f"cup; {AS_FAR}" and found["verified"]["labels"] == {f"bowl; {AS_BACKGROUND}": 6}
     with Store(run / "results.sqlite", read_only=True) as store:
         payloads: list[Any] = [row.payload for row in store.rows("verification")]
     for one in payloads:
@@ -103,7 +103,7 @@ def test_tasks_are_joined_by_a_plus_or_in_a_list(asked: Any, kept: Any) -> None:
     config = AttackConfig(object="mug", model="a.pt2,b.pt2", task=asked)
     assert config.task == kept and config.models == ("a.pt2,b.pt2",) and not config.is_matrix
     made = make_task(config.task)
-    assert isinstance(made, Together) and [type(one) for one in made.parts] == [Detection, Depth]
+    assert isinstance(made, EnsembleTask) and [type(one) for one in made.parts] == [Detection, Depth]
 
 
 def test_each_task_has_a_model() -> None:
@@ -130,11 +130,11 @@ def test_each_is_judged_by_its_own_rule() -> None:
     """A label goes to the task that takes one, a picture to both; the objective is the least of both."""
     parts = (Segmentation(), Depth(kind=DISPARITY, seek="farther"))
     both = models((Painter(), parts[0], ["background", "mug", "dog"]), (Ranger(), parts[1], None))
-    task = Together(parts=parts).on(model := together(both))
+    task = EnsembleTask(parts=parts).on(model := join_models(both))
     mask = torch.zeros(SIDE, SIDE).bool()
     mask[8:20, 8:20] = True
     distance = torch.linspace(3.0, 2.0, SIDE)[:, None].expand(SIDE, SIDE) - 0.5 * mask
-    facts = Facts("mug", "mug", look=lambda: Sight(mask, distance, distance))
+    facts = Facts("mug", "mug", compute_sight=lambda: Sight(mask, distance, distance))
     task.check(facts)
     truth = task.truth(facts)
     output = model(torch.rand((SIDE, SIDE, 3), generator=torch.Generator().manual_seed(0)))
@@ -145,11 +145,11 @@ def test_each_is_judged_by_its_own_rule() -> None:
     scores = [float(one.score(said, true)) for one, said, true in own]
     (judged,) = task.judge(output, truth)
     assert judged.margin == min(margins) and judged.score == min(scores) and judged.right is (min(margins) >= 0.0)
-    objective, _ = objective_for("each", task, model, None, 0)  # type: ignore[arg-type]
+    objective, _ = make_objective("each", task, model, None, 0)  # type: ignore[arg-type]
     values = [float(parts[0].pixel_margin(output[0][0], truth[0])), scores[1]]
     assert float(objective(output, torch.zeros(1), truth)) == pytest.approx(min(values))
-    assert judged.prediction.label.count(";") == 1 and task.told(task.tasks[1], facts).label is None
+    assert judged.prediction.label.count(";") == 1 and task.select_facts(task.tasks[1], facts).label is None
     with pytest.raises(InputError, match="model: expected 2, one for each task, got 1"):
-        Together(parts=parts).on(both[0])
+        EnsembleTask(parts=parts).on(both[0])
     with pytest.raises(InputError, match="label: task depth has no classes"):
-        Together(parts=parts[1:], tasks=task.tasks[1:]).check(facts)
+        EnsembleTask(parts=parts[1:], tasks=task.tasks[1:]).check(facts)

@@ -14,14 +14,14 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
-from advsearch.models.labels import names_in, read_labels
+from advsearch.models.labels import parse_names, read_labels
 from advsearch.tasks import Detection
-from advsearch.tasks.boxes import Place, left_over, overlap
-from advsearch.tasks.detector_outputs import order_in
+from advsearch.tasks.boxes import DetectionTruth, compute_iou, suppress_class
+from advsearch.tasks.detector_outputs import infer_order
 
 CUP = (20.0, 40.0, 60.0, 90.0)
 PICTURE = torch.full((100, 100, 3), 0.25)
-TRUTH = Place((1,), (20, 40, 60, 90), (100, 100))
+TRUTH = DetectionTruth((1,), (20, 40, 60, 90), (100, 100))
 NAMES = ("bowl", "cup", "dog")
 PLACES = 21
 
@@ -126,7 +126,7 @@ def on(network: nn.Module, labels: Any = NAMES, **options: Any) -> tuple[Detecti
     model = load_model(network, input_size=100, read=task.reader, labels=labels)
     output = model(PICTURE)
     names = tuple(labels)
-    return task.on(model).after_calibration(output, Place((cup(len(names)),), TRUTH.box, TRUTH.size)), output
+    return task.on(model).after_calibration(output, DetectionTruth((cup(len(names)),), TRUTH.box, TRUTH.size)), output
 
 
 @pytest.mark.filterwarnings("ignore:no gradient")
@@ -136,7 +136,7 @@ def test_each_form_is_read_right(form: str, classes: int) -> None:
     made, objectness, order = FORMS[form]
     names = read_labels("coco") if classes == 80 else tuple(f"thing {k}" for k in range(classes))
     task, output = on(Head(made, classes, objectness), names)
-    truth = Place((cup(classes),), TRUTH.box, TRUTH.size)
+    truth = DetectionTruth((cup(classes),), TRUTH.box, TRUTH.size)
     (found,) = task.judge(output, truth)
     score = 0.8 * (objectness or 1.0)
     assert found.right and astuple(found.prediction) == (
@@ -209,7 +209,7 @@ def test_what_fits_twice_is_asked_for() -> None:
     with pytest.raises(InputError, match=f"{V8}.*or .*{V8_LAST}"):
         on(Head(square, len(names)), names)
     task, output = on(Head(square, len(names)), names, order=V8)
-    truth = Place((cup(len(names)),), TRUTH.box, TRUTH.size)
+    truth = DetectionTruth((cup(len(names)),), TRUTH.box, TRUTH.size)
     assert task.judge(output, truth)[0].prediction.probability == pytest.approx(0.8, abs=1e-4) and not task.remarks
 
 
@@ -225,9 +225,9 @@ def test_an_order_says_what_a_head_is(order: str) -> None:
 def test_a_class_that_is_counted_from_one_is_no_probability() -> None:
     """Of the only class, which nobody has named: its number is 1, and no score of 1."""
     rows = [{"boxes": torch.tensor([[20.0, 40.0, 60.0, 90.0]] * 2), "either": torch.tensor([[0.8, 1.0], [0.6, 1.0]])}]
-    assert order_in(rows, 1) == "boxes scores labels"
+    assert infer_order(rows, 1) == "boxes scores labels"
     rows[0]["either"] = torch.tensor([[0.8, 0.9], [0.6, 0.9]])
-    assert order_in(rows, 1) == V5 and order_in(rows, 2) == V8_LAST
+    assert infer_order(rows, 1) == V5 and infer_order(rows, 2) == V8_LAST
 
 
 def test_boxes_of_a_head_in_another_form_are_noted() -> None:
@@ -256,12 +256,12 @@ def test_names_and_size_come_from_the_network(names: Any) -> None:
 def test_suppression_in_rounds_leaves_what_the_greedy_one_does(iou: float) -> None:
     numbers = torch.rand(300, 5, generator=torch.Generator().manual_seed(1))
     boxes = torch.cat([numbers[:, :2], numbers[:, :2] + 0.4 * numbers[:, 2:4]], dim=1)
-    left = left_over(boxes, numbers[:, 4], iou).nonzero().flatten().tolist()
+    left = suppress_class(boxes, numbers[:, 4], iou).nonzero().flatten().tolist()
     waiting, greedy = numbers[:, 4].argsort(descending=True), list[int]()
     while len(waiting):
         best, waiting = waiting[0], waiting[1:]
         greedy.append(int(best))
-        waiting = waiting[overlap(boxes[waiting], boxes[best]) < iou]
+        waiting = waiting[compute_iou(boxes[waiting], boxes[best]) < iou]
     assert left == sorted(greedy) and 10 < len(left) < 295
 
 
@@ -272,7 +272,7 @@ def test_many_boxes_that_overlap_are_suppressed_at_once() -> None:
     raw[:, 4:] *= 0.09
     raw[:, 4 + 41] = raw[:, 4 + 41] * 10.0
     task = Detection(labels=read_labels("coco"), unit="pixels", order=V8, input_size=(640, 640), confidence=0.25)
-    truth = Place((41,), (35, 35, 75, 75), (640, 640))
+    truth = DetectionTruth((41,), (35, 35, 75, 75), (640, 640))
     (found,) = task.judge(task.read(raw, 1), truth)
     assert found.prediction.label == "cup" and found.right
 
@@ -379,4 +379,4 @@ def test_a_file_of_onnx_says_names_and_size(tmp_path: Path) -> None:
     ],
 )
 def test_names_in_metadata_are_plain_texts_or_nothing(text: str, names: tuple[str, ...] | None) -> None:
-    assert names_in(text) == names
+    assert parse_names(text) == names

@@ -20,8 +20,8 @@ from advsearch.report.wording import interval_text, objective_label, percent, se
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.files import read_png
 from advsearch.statistics.intervals import clopper_pearson
-from advsearch.viewer.document import asset
-from advsearch.viewer.pages import LARGE_PICTURE, LARGEST, SMALLER_SIDE, object_part, read_object
+from advsearch.viewer.document import read_asset
+from advsearch.viewer.pages import MAX_OBJECT_BYTES, MAX_SCALED_SIZE, MAX_UNSCALED_BYTES, make_object_part, read_object
 from samples import (
     ATTACK,
     AVERAGE,
@@ -141,7 +141,7 @@ def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
     keep_object(run)
     text = written_page(run).read_text()
-    page, code = Page(text), "\n".join(map(asset, ("make.js", "attack.js", "object.js")))
+    page, code = Page(text), "\n".join(map(read_asset, ("make.js", "attack.js", "object.js")))
     assert code in text
     assert not re.search(r"\b(fetch|import|XMLHttpRequest|WebSocket|https?:)", code)
     assert "//" not in re.sub(r'(base64,|id="object-file">")[A-Za-z0-9+/=]+', "", text.replace(code, ""))
@@ -172,8 +172,8 @@ def test_a_phone_gets_a_chart_that_fits_with_letters_that_can_be_read(tmp_path: 
     assert (
         width <= 390 - 2 * 20
     )  # what the page leaves of a phone: letters of 13 are drawn as such, and nothing scrolls
-    assert "min-width" not in re.findall(r"svg\.chart \{[^}]*\}", asset("document.css"))[0]
-    css = asset("document.css")
+    assert "min-width" not in re.findall(r"svg\.chart \{[^}]*\}", read_asset("document.css"))[0]
+    css = read_asset("document.css")
     phone = css.index("@media (max-width: 34rem)")
     assert css.index("svg.narrow { display: none; }") < phone < css.index("svg.narrow { display: block; }")
 
@@ -233,12 +233,12 @@ def test_a_large_picture_is_embedded_smaller(tmp_path: Path) -> None:
     from advsearch.runs.files import write_png
 
     write_png(large, noise)
-    assert large.stat().st_size > LARGE_PICTURE
+    assert large.stat().st_size > MAX_UNSCALED_BYTES
     source = next(str(image["src"]) for image in page_of(run).all("img") if "found" in str(image["alt"]))
     import base64
 
     (tmp_path / "small.png").write_bytes(base64.b64decode(source.partition(",")[2]))
-    assert read_png(tmp_path / "small.png").shape == (SMALLER_SIDE, SMALLER_SIDE, 3)
+    assert read_png(tmp_path / "small.png").shape == (MAX_SCALED_SIZE, MAX_SCALED_SIZE, 3)
 
 
 def test_without_a_summary_there_is_no_page(tmp_path: Path) -> None:
@@ -427,9 +427,9 @@ def test_several_controls_have_a_budget_each() -> None:
 def test_conditions_that_the_clean_scene_fails_are_said_not_to_count() -> None:
     clean = {**ATTACK["clean"], "control": {"correct": 188, "trials": 200, "rate": 0.94, "interval": [0.9, 0.97]}}
     said = "The clean scene itself fails 12 of its 200 trials."
-    assert wording.remarks(attack(clean=clean, baseline=None, over=["camera"])) == [f"{said} They do not count."]
-    assert wording.remarks(attack(clean=clean, baseline=None)) == [said]
-    assert wording.remarks(attack(clean=clean, baseline=None, **EASIER)) == []
+    assert wording.make_remarks(attack(clean=clean, baseline=None, over=["camera"])) == [f"{said} They do not count."]
+    assert wording.make_remarks(attack(clean=clean, baseline=None)) == [said]
+    assert wording.make_remarks(attack(clean=clean, baseline=None, **EASIER)) == []
 
 
 @pytest.mark.parametrize(
@@ -440,13 +440,13 @@ def test_conditions_that_the_clean_scene_fails_are_said_not_to_count() -> None:
     ],
 )
 def test_a_random_search_that_does_as_well_is_said(successes: int, remark: list[str]) -> None:
-    assert wording.remarks(attack(baseline={**ATTACK["baseline"], "verified": rated(successes)})) == remark
+    assert wording.make_remarks(attack(baseline={**ATTACK["baseline"], "verified": rated(successes)})) == remark
 
 
 def test_a_better_random_search_and_a_failing_control_group_are_said() -> None:
     clean = {**ATTACK["clean"], "control": {"correct": 18, "trials": 20, "rate": 0.9, "interval": [0.7, 0.99]}}
     summary = attack(verified=rated(3), baseline={**ATTACK["baseline"], "verified": rated(5)}, clean=clean)
-    assert wording.remarks(summary) == [
+    assert wording.make_remarks(summary) == [
         "The clean scene itself fails 2 of its 20 trials.",
         "Random search with as many renders does better: 5 of 20.",
     ]
@@ -456,7 +456,7 @@ def test_of_a_path_each_trial_has_another_moment() -> None:
     said = {(): "", ("camera", "light"): ", each with another camera and light"}
     said |= {("path",): ", each at another moment of the path"}
     said |= {("path", "camera"): ", each with another camera and at another moment of the path"}
-    assert {over: wording.another_text(over) for over in said} == said
+    assert {over: wording.condition_text(over) for over in said} == said
 
 
 def test_the_ends_of_an_interval_have_the_digits_that_fit_and_are_not_clamped() -> None:
@@ -495,7 +495,9 @@ def test_times(seconds: float | None, text: str) -> None:
 
 def test_where_random_search_won_it_is_said() -> None:
     own = rated(3, margin=-1.25)
-    (said,) = [text for text in wording.remarks(attack(answer_from="random", policy_verified=own)) if "random" in text]
+    (said,) = [
+        text for text in wording.make_remarks(attack(answer_from="random", policy_verified=own)) if "random" in text
+    ]
     assert "worse configuration than the policy did (3 of 20 with a margin of -1.25)" in said
 
 
@@ -505,11 +507,11 @@ def test_a_damaged_object_is_left_out(tmp_path: Path) -> None:
     keep_object(tmp_path)
     good = file.read_bytes()
     assert read_object(tmp_path) == good
-    assert "It has fewer faces here." in object_part(good).note
-    for data in (b"", b"glTF", b"glTF" + bytes(40), b"GIF89a" * 9, good[:2000], good + bytes(LARGEST)):
+    assert "It has fewer faces here." in make_object_part(good).note
+    for data in (b"", b"glTF", b"glTF" + bytes(40), b"GIF89a" * 9, good[:2000], good + bytes(MAX_OBJECT_BYTES)):
         file.write_bytes(data)
         assert read_object(tmp_path) == b""
-    assert object_part(b"").empty
+    assert make_object_part(b"").empty
 
 
 METHOD: dict[str, Any] = {

@@ -31,7 +31,7 @@ from advsearch.runs.results import Result
 from advsearch.runs.store import Row, Store, Told
 from advsearch.tasks import Prediction
 from advsearch.viewer import thumbnails
-from advsearch.viewer.document import asset
+from advsearch.viewer.document import read_asset
 from advsearch.viewer.pages import write_page
 from covering import once_each
 from samples import (
@@ -538,7 +538,7 @@ def test_without_a_script_there_are_still_pictures(
 
 def test_drawn_parameters_are_shown_in_the_parts_of_the_table(browser: Browser) -> None:
     """Those that the columns name, whatever was drawn; numbers and answers in words are those of the terminal."""
-    code = asset("sweep.js")
+    code = read_asset("sweep.js")
     code = code[code.index("(() => {") : code.index("  // ---- the explorer")]
     page = browser.new_page()
     given = "{name: 'd', unit: '', levels: null, edges: [1, 10, 100], data: Float32Array.of(2, 10, 99, 50, 20)}"
@@ -561,7 +561,7 @@ def test_drawn_parameters_are_shown_in_the_parts_of_the_table(browser: Browser) 
 def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Path) -> None:
     from advsearch.statistics.intervals import clopper_pearson
 
-    code = asset("sweep.js")
+    code = read_asset("sweep.js")
     part = code[code.index("  const factorials") : code.index("  function colour")]
     page = browser.new_page()
     for right, count in (
@@ -579,14 +579,14 @@ def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Pat
 
 
 def test_intervals_over_drives_are_those_of_the_summary(browser: Browser) -> None:
-    from advsearch.statistics.clustered import share_interval
+    from advsearch.statistics.clustered import rate_interval
 
-    code = asset("sweep.js")
+    code = read_asset("sweep.js")
     part, page = code[code.index("  const STAKES") : code.index("  function colour")], browser.new_page()
     for units in ([[5, 5, 3], [2, 5, 1], [0, 5, 2]], [[3, 5, 1], [0, 2, 4]], [[4, 4, 5]], [[0, 3, 2]]):
         right, of = zip(*((right, of) for right, of, times in units for _ in range(times)), strict=True)
         mine = page.evaluate(f"(() => {{ {part}; return intervalOver({units}); }})()")
-        assert mine == pytest.approx(share_interval(right, of), abs=1e-6), units
+        assert mine == pytest.approx(rate_interval(right, of), abs=1e-6), units
 
 
 # ---- photographs ----------------------------------------------------------------------------------------------------
@@ -599,7 +599,7 @@ def test_a_photograph_is_aligned_taken_and_counted(browser: Browser, tmp_path: P
     run = make_sweep(tmp_path / "first", keep="all")
     settings: dict[str, Any] = {"ignore_https_errors": True, "bypass_csp": True}
     with serving(run, host="0.0.0.0", photographs=Photographs()) as server:
-        with opened(browser, server.address_of("/runs/first/align/"), 390, **settings) as page:
+        with opened(browser, server.make_url("/runs/first/align/"), 390, **settings) as page:
             status = page.locator("#align .status")
             until(page, lambda: status.inner_text() == "Rendering 0.")
             assert page.get_by_role("button", name="Take a photograph").is_disabled()
@@ -635,7 +635,7 @@ def test_edges_alone_are_drawn_from_the_rendering(browser: Browser, tmp_path: Pa
     run = make_sweep(tmp_path / "first", keep="all")
     square = np.zeros((64, 64, 3), np.float32)
     square[16:48, 16:48] = 1.0
-    thumbnails.keep(run, 5, thumbnails.thumbnail(square))
+    thumbnails.write_thumbnail(run, 5, thumbnails.make_thumbnail(square))
     with serving(run, photographs=Photographs()) as server:
         with opened(browser, f"{server.address}runs/first/align/?rendering=5") as page:
             until(page, lambda: page.locator("#align .status").inner_text() == "Rendering 5.")

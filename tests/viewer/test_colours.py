@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from advsearch.viewer.document import asset
+from advsearch.viewer.document import read_asset
 
 Doubles = NDArray[np.float64]
 
@@ -43,12 +43,14 @@ def lab(colour: Sequence[float], vision: str) -> Doubles:
 
 def colours(pattern: str) -> list[list[float]]:
     """Colours of the style sheet, by a pattern that names their digits."""
-    return [[int(text[k : k + 2], 16) / 255.0 for k in (0, 2, 4)] for text in re.findall(pattern, asset("viewer.css"))]
+    return [
+        [int(text[k : k + 2], 16) / 255.0 for k in (0, 2, 4)] for text in re.findall(pattern, read_asset("viewer.css"))
+    ]
 
 
 @pytest.mark.parametrize("vision", VISIONS)
 def test_the_colours_of_a_map_go_from_dark_to_light(vision: str) -> None:
-    shades = json.loads(re.findall(r"const MAP = (.*?);", asset("sweep.js"))[0])
+    shades = json.loads(re.findall(r"const MAP = (.*?);", read_asset("sweep.js"))[0])
     lightness = [lab([value / 255.0 for value in shade], vision)[0] for shade in shades]
     assert min(np.diff(lightness)) > 7.0
 

@@ -13,8 +13,8 @@ import numpy as np
 from advsearch.options import Value
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.tables import sweep_frame
-from advsearch.viewer.columns import NO_PROBABILITY, UNKNOWN, packed, read_columns
-from advsearch.viewer.thumbnails import kept_pictures, path_of
+from advsearch.viewer.columns import NO_PROBABILITY, UNKNOWN, pack_columns, read_columns
+from advsearch.viewer.thumbnails import find_thumbnails, thumbnail_path
 from stored_sweeps import make_sweep
 
 
@@ -28,7 +28,7 @@ def row(step: int, **values: Any) -> Row:
 
 def unpacked(rows: Iterable[Row]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Head and columns as a reader of the bytes finds them."""
-    data = packed(sweep_frame(rows))
+    data = pack_columns(sweep_frame(rows))
     size = int.from_bytes(data[:4], "little")
     head = json.loads(data[4 : 4 + size])
     kinds = {one["name"]: (np.dtype(one["type"]), one["at"]) for one in head["columns"]}
@@ -40,13 +40,13 @@ def unpacked(rows: Iterable[Row]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def test_a_page_embeds_the_pictures_of_the_worst_margins(tmp_path: Path) -> None:
     run = make_sweep(tmp_path / "run", keep="all")
-    kept, columns = kept_pictures(run), read_columns(run)
+    kept, columns = find_thumbnails(run), read_columns(run)
     assert kept is not None
     wrong = [step for step, right in zip(columns["step"], columns["correct"], strict=True) if not right]
-    first = [number for number, _ in kept.embedded(columns, most=1 << 20)][: len(wrong)]
+    first = [number for number, _ in kept.list_data_urls(columns, max_bytes=1 << 20)][: len(wrong)]
     assert first == [str(step) for step in sorted(wrong, reverse=True)]  # the margin of a wrong one falls with its step
-    size = len(path_of(run, max(wrong)).read_bytes()) * 4 // 3
-    assert [number for number, _ in kept.embedded(columns, most=size)] == first[:1]
+    size = len(thumbnail_path(run, max(wrong)).read_bytes()) * 4 // 3
+    assert [number for number, _ in kept.list_data_urls(columns, max_bytes=size)] == first[:1]
 
 
 def test_what_is_packed_is_what_the_rows_are() -> None:
@@ -89,7 +89,7 @@ def test_rows_are_read_in_parts(tmp_path: Path) -> None:
     with Store(tmp_path / NAME) as store:
         store.append([row(k, yaw=float(k)) for k in range(10)])
         store.append([Row("verification", 0)])
-    first = read_columns(tmp_path, most=4)
+    first = read_columns(tmp_path, max_rows=4)
     assert (first["step"].tolist(), first["id"].iloc[-1]) == ([0, 1, 2, 3], 4)
     assert read_columns(tmp_path, after=4)["step"].tolist() == [4, 5, 6, 7, 8, 9]
     assert read_columns(tmp_path, after=10)["step"].tolist() == []

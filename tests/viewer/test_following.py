@@ -12,7 +12,7 @@ import numpy as np
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
-from advsearch.viewer.server import START, following_page, is_under_way, progress_json
+from advsearch.viewer.server import FIRST_ROW_ID, is_unfinished, make_progress_json, make_progress_page
 from stored_sweeps import described, serving
 
 
@@ -24,8 +24,8 @@ def step(run: RunDirectory, number: int, *, picture: bool = True) -> None:
     run.record(Row("search", number, objective=float(number), success=False, label="mug", values=values), told=told)
 
 
-def news(run: Path, after: int = START) -> dict[str, Any]:
-    found = json.loads(progress_json(run, after))
+def news(run: Path, after: int = FIRST_ROW_ID) -> dict[str, Any]:
+    found = json.loads(make_progress_json(run, after))
     assert isinstance(found, dict)
     return found
 
@@ -60,13 +60,13 @@ def test_its_own_page_is_shown_when_it_has_ended(tmp_path: Path) -> None:
         with urlopen(address) as answer:
             page = answer.read().decode()
         assert "has not ended" in page and "A process is working on it." in page and "1 of search" in page
-        with urlopen(f"{address}progress?after={START}") as answer:
+        with urlopen(f"{address}progress?after={FIRST_ROW_ID}") as answer:
             assert answer.headers["Content-Type"] == "application/json"
             assert len(json.load(answer)["rows"]) == 1
         (path / "report.html").write_text("what came out")
-        assert is_under_way(path)  # an attack that is resumed has the page of its first sitting
+        assert is_unfinished(path)  # an attack that is resumed has the page of its first sitting
         run.store.forget()
-        assert not is_under_way(path) and news(path)["ended"]
+        assert not is_unfinished(path) and news(path)["ended"]
         with urlopen(address) as answer:
             assert answer.read().endswith(b"what came out")
 
@@ -77,6 +77,6 @@ def test_a_study_that_goes_on_leads_to_what_has_ended(tmp_path: Path) -> None:
         for name in ("00-mug", "01-bowl"):
             (path / "parts" / name).mkdir(parents=True)
         (path / "parts" / "00-mug" / "report.html").write_text("")
-        page = following_page("<b>", path)
+        page = make_progress_page("<b>", path)
     assert 'href="parts/00-mug/report.html"' in page and "01-bowl" in page and "parts/01-bowl" not in page
     assert "<b>" not in page

@@ -24,8 +24,8 @@ HOSTILE = "<img src=x onerror=document.title='planted'>"
 def test_boxes_of_all_rows_are_one_list_with_an_end_for_each_row() -> None:
     boxes = Boxes()
     found = [{"box": [1.0, 2.0, 3.5, 4.0], "label": "car", "score": 0.25}]
-    boxes.put({"box": None, "found": found, "things": {"near": {"box": [0, 0, 9000.0, 2]}, "hidden": {"box": None}}})
-    assert list(boxes.numbers) == [0, 0, 65534, 16, 0, 65535, 8, 16, 28, 32, 1, 2500]
+    boxes.add({"box": None, "found": found, "things": {"near": {"box": [0, 0, 9000.0, 2]}, "hidden": {"box": None}}})
+    assert list(boxes.values) == [0, 0, 65534, 16, 0, 65535, 8, 16, 28, 32, 1, 2500]
     assert boxes.names == {"near": 0, "car": 1} and copy.deepcopy(boxes) is boxes
 
 

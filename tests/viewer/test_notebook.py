@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from advsearch.questions.attack.summary import CurveResult
-from advsearch.questions.sweep.display import sweep_axes
+from advsearch.questions.sweep.display import draw_sweep_on
 from advsearch.report.figures import search_axes
 from advsearch.report.views import side_by_side
 from conftest import ROOT
@@ -78,7 +78,7 @@ def test_a_search_is_drawn_with_its_best() -> None:
 
 def test_a_sweep_without_axes_draws_nothing() -> None:
     axes = Figure().subplots()
-    sweep_axes(sweep(axes=[], cells=None), axes)
+    draw_sweep_on(sweep(axes=[], cells=None), axes)
     assert not axes.has_data()
 
 

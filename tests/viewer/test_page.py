@@ -13,7 +13,7 @@ import pytest
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
-from advsearch.viewer.document import asset
+from advsearch.viewer.document import read_asset
 from advsearch.viewer.pages import write_page
 from stored_sweeps import make_sweep
 
@@ -100,5 +100,5 @@ def test_several_runs_need_a_folder(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 def test_the_explorer_is_plain_text() -> None:
     """It stands between script tags as it is."""
-    assert "</script" not in asset("sweep.js").lower()
-    assert "<!--" not in asset("sweep.js")
+    assert "</script" not in read_asset("sweep.js").lower()
+    assert "<!--" not in read_asset("sweep.js")

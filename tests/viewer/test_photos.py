@@ -25,17 +25,17 @@ from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.photographs.carry_out import Photographs, photo_agreement
 from advsearch.questions.photographs.result import (
-    align_page,
-    photo_file,
-    rendering_file,
-    rendering_names,
-    sound_photo,
+    find_photo,
+    find_rendering,
+    list_renderings,
+    make_align_page,
+    sanitize_photo,
 )
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.trust.network import https_context
-from advsearch.viewer.clients import LARGEST_SENT, reachable
+from advsearch.viewer.clients import MAX_BODY_BYTES, find_reachable_address
 from advsearch.viewer.server import Dashboard
 from samples import make_run
 from stored_sweeps import make_sweep, serving
@@ -64,7 +64,7 @@ def post(
     """The answer to a photograph, sent as the page does; headers that are None are left out."""
     host, name = f"127.0.0.1:{server.server_port}", unquote([*path.split("/"), "", ""][2])
     given: dict[str, str | None] = {
-        "Origin": f"{server.scheme}://{host}", "X-Advsearch-Key": server.key(name), "Content-Length": str(len(data)),
+        "Origin": f"{server.scheme}://{host}", "X-Advsearch-Key": server.make_key(name), "Content-Length": str(len(data)),
         **{name.replace("_", "-"): text for name, text in headers.items()},
     }  # fmt: skip
     context = ssl._create_unverified_context() if secure else None
@@ -113,12 +113,12 @@ def test_a_photograph_is_cut_to_the_renderings_shape_and_says_nothing_else() -> 
     exif = Image.Exif()
     exif[0x010F], exif[0x0112] = "a phone", 6  # the maker; turned by a quarter
     Image.new("RGB", (300, 100), (200, 0, 0)).save(stream, "JPEG", exif=exif)
-    with Image.open(io.BytesIO(sound_photo(stream.getvalue(), (40, 60)))) as image:
+    with Image.open(io.BytesIO(sanitize_photo(stream.getvalue(), (40, 60)))) as image:
         assert image.format == "JPEG"
         assert image.size == (200, 300)
         assert not image.getexif()
         assert "exif" not in image.info
-    with Image.open(io.BytesIO(sound_photo(picture((3000, 2000), "WEBP"), (16, 16)))) as image:
+    with Image.open(io.BytesIO(sanitize_photo(picture((3000, 2000), "WEBP"), (16, 16)))) as image:
         assert image.size == (1024, 1024)
 
 
@@ -133,12 +133,12 @@ def test_a_photograph_is_cut_to_the_renderings_shape_and_says_nothing_else() -> 
         (bomb(12_000), "at most 50,000,000 pixels"),
         (bomb(60_000), "at most 50,000,000 pixels"),
         (bomb(100), "expected a picture"),
-        (bytes(LARGEST_SENT + 1), "at most 16 MB"),
+        (bytes(MAX_BODY_BYTES + 1), "at most 16 MB"),
     ],
 )
 def test_what_is_no_photograph_is_refused(data: bytes, text: str) -> None:
     with pytest.raises(InputError, match=text):
-        sound_photo(data, (16, 16))
+        sanitize_photo(data, (16, 16))
 
 
 @pytest.mark.parametrize(
@@ -146,16 +146,16 @@ def test_what_is_no_photograph_is_refused(data: bytes, text: str) -> None:
 )
 def test_a_rendering_is_found_by_its_own_name_only(run: Path, name: str) -> None:
     with pytest.raises(InputError):
-        rendering_file(run, name)
+        find_rendering(run, name)
     with pytest.raises(InputError):
-        photo_file(run, name)
+        find_photo(run, name)
 
 
 def test_renderings_are_those_that_were_kept(run: Path, tmp_path: Path) -> None:
-    assert rendering_names(run) == tuple(map(str, range(24)))
-    assert rendering_names(make_sweep(tmp_path / "none")) == ()
+    assert list_renderings(run) == tuple(map(str, range(24)))
+    assert list_renderings(make_sweep(tmp_path / "none")) == ()
     attack = make_run(tmp_path / "attack")
-    assert rendering_names(attack) == ("adversarial", "clean", "verification-00", "verification-01")
+    assert list_renderings(attack) == ("adversarial", "clean", "verification-00", "verification-01")
 
 
 # ---- judged and counted ---------------------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ def test_photographs_are_judged_by_the_runs_model_and_counted(tmp_path: Path, ta
     assert (two.rendering, two.label, two.rendering_right, two.photos, two.agreeing) == ("2", "cup", False, 2, 2)
     assert two.interval == clopper_pearson(2, 2)
     assert two.files == ["2-0001.jpg", "2-0002.jpg"]
-    assert all(photo_file(run, name).read_bytes()[:2] == b"\xff\xd8" for name in (*one.files, *two.files))
+    assert all(find_photo(run, name).read_bytes()[:2] == b"\xff\xd8" for name in (*one.files, *two.files))
     with Store(run / "results.sqlite", read_only=True) as store:
         row = store.row("photo", 1)
     assert row is not None
@@ -229,7 +229,7 @@ def test_a_page_takes_a_photograph(server: Dashboard, run: Path) -> None:
         ({"Host": "evil.example"}, 403),
         ({"Content_Length": None}, 411),
         ({"Content_Length": "-5"}, 411),
-        ({"Content_Length": str(LARGEST_SENT + 1)}, 413),
+        ({"Content_Length": str(MAX_BODY_BYTES + 1)}, 413),
         ({"Content_Length": "9" * 15}, 413),
     ],
 )
@@ -248,7 +248,7 @@ def ask_as(server: Dashboard, host: str) -> tuple[HTTPResponse, bytes]:
     """The answer to a photograph for another host's name."""
     made = HTTPConnection("127.0.0.1", server.server_port, timeout=600)
     made.putrequest("POST", PATH, skip_host=True)
-    for name, text in (("Host", host), ("Origin", f"http://{host}"), ("X-Advsearch-Key", server.key("first"))):
+    for name, text in (("Host", host), ("Origin", f"http://{host}"), ("X-Advsearch-Key", server.make_key("first"))):
         made.putheader(name, text)
     made.endheaders()
     answer = made.getresponse()
@@ -291,7 +291,7 @@ def test_renderings_and_photographs_are_shown(server: Dashboard, run: Path) -> N
         assert made.getresponse().read() == (run / found).read_bytes()
     made.request("GET", "/runs/first/align/")
     page = made.getresponse().read().decode()
-    assert server.key("first") in page
+    assert server.make_key("first") in page
     assert "Renderings of this run (24): 0, 1" in page
 
 
@@ -342,17 +342,17 @@ def test_without_openssl_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch
 
 
 def test_any_address_is_told_as_one_that_others_reach() -> None:
-    assert reachable("192.0.2.7") == "192.0.2.7"
-    assert reachable("0.0.0.0") not in ("0.0.0.0", "")
+    assert find_reachable_address("192.0.2.7") == "192.0.2.7"
+    assert find_reachable_address("0.0.0.0") not in ("0.0.0.0", "")
 
 
 def test_the_page_shows_a_code_for_a_phone(run: Path, tmp_path: Path) -> None:
     table = photo_agreement(make_sweep(tmp_path / "none"))
-    page = align_page("a", ("0",), table, "key", "https://192.0.2.7:1/?token=t")
+    page = make_align_page("a", ("0",), table, "key", "https://192.0.2.7:1/?token=t")
     assert "<svg" in page
     assert "https://192.0.2.7:1/?token=t" in page
-    assert "<svg" not in align_page("a", ("0",), table, "key", None)
-    assert "keep_pictures=all" in align_page("a", (), table, "key", None)
+    assert "<svg" not in make_align_page("a", ("0",), table, "key", None)
+    assert "keep_pictures=all" in make_align_page("a", (), table, "key", None)
 
 
 def test_show_prints_the_table(tmp_path: Path, taker: Photographs, capsys: pytest.CaptureFixture[str]) -> None:

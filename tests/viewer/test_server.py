@@ -24,9 +24,9 @@ from advsearch.errors import InputError
 from advsearch.questions.photographs.result import PhotoAgreement
 from advsearch.runs.directory import RunDirectory
 from advsearch.viewer import clients
-from advsearch.viewer.document import document, has_other_scripts
+from advsearch.viewer.document import has_other_scripts, make_document
 from advsearch.viewer.server import Dashboard
-from advsearch.viewer.thumbnails import Kept
+from advsearch.viewer.thumbnails import Thumbnails
 from samples import make_run, written_page
 from stored_sweeps import make_sweep, serving
 
@@ -108,11 +108,11 @@ def test_a_page_lists_no_pictures_where_all_are_kept(tmp_path: Path, monkeypatch
     every, wrong = (make_sweep(tmp_path / keep, keep=keep) for keep in ("all", "wrong"))
     listed: list[str] = []
 
-    def numbers(kept: Kept) -> tuple[int, ...]:
+    def numbers(kept: Thumbnails) -> tuple[int, ...]:
         listed.append(kept.run.name)
         return 10, 11
 
-    monkeypatch.setattr(Kept, "numbers", property(numbers))
+    monkeypatch.setattr(Thumbnails, "numbers", property(numbers))
     with serving(every, wrong) as server:
         assert b'"kept":null' in ask(server, "/runs/all/")[1].replace(b" ", b"")
         assert b'"kept":[10,11]' in ask(server, "/runs/wrong/")[1].replace(b" ", b"")
@@ -227,7 +227,7 @@ def test_a_thousand_at_once_are_answered(server: Dashboard) -> None:
 
 def test_those_who_say_nothing_do_not_fill_the_server(server: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand connections that never ask hold it up for as long as its patience lasts, no longer."""
-    monkeypatch.setattr("advsearch.viewer.clients.PATIENCE", 0.01)
+    monkeypatch.setattr("advsearch.viewer.clients.REQUEST_SECONDS", 0.01)
     with ExitStack() as stack:
         for _ in range(1000):
             stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 60))
@@ -236,9 +236,9 @@ def test_those_who_say_nothing_do_not_fill_the_server(server: Dashboard, monkeyp
 
 def test_who_waits_when_it_closes_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """No worker is there to serve one that has asked."""
-    monkeypatch.setattr("advsearch.viewer.clients.WORKERS", 0)
+    monkeypatch.setattr("advsearch.viewer.clients.N_WORKERS", 0)
     with socket.create_server(("127.0.0.1", 0)) as listening:
-        served = clients.Clients(listening, lambda connection, address: None, None)
+        served = clients.ConnectionPool(listening, lambda connection, address: None, None)
         thread = threading.Thread(target=served.serve)
         thread.start()
         with socket.create_connection(listening.getsockname()) as asking:
@@ -284,15 +284,15 @@ def slow_clients(server: Dashboard, count: int, begun: bytes) -> Iterator[list[s
 )
 def test_slow_clients_keep_nobody_out(server: Dashboard, begun: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     """More of them than workers: each has a little while where others wait, in all and not for each letter."""
-    monkeypatch.setattr("advsearch.viewer.clients.PATIENCE", 1e6)
-    monkeypatch.setattr("advsearch.viewer.clients.GRACE", 0.2)
-    with slow_clients(server, 3 * clients.WORKERS, begun):
+    monkeypatch.setattr("advsearch.viewer.clients.REQUEST_SECONDS", 1e6)
+    monkeypatch.setattr("advsearch.viewer.clients.SLOW_CLIENT_SECONDS", 0.2)
+    with slow_clients(server, 3 * clients.N_WORKERS, begun):
         for _ in range(3):
             assert ask(server, "/")[0].status == 200
 
 
 def test_a_request_has_its_time_in_all(server: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.viewer.clients.PATIENCE", 0.2)
+    monkeypatch.setattr("advsearch.viewer.clients.REQUEST_SECONDS", 0.2)
     with slow_clients(server, 2, b"GET / HTTP/1.0\r\nA: ") as talks:
         for talk in talks:
             with suppress(ConnectionResetError):
@@ -301,10 +301,10 @@ def test_a_request_has_its_time_in_all(server: Dashboard, monkeypatch: pytest.Mo
 
 @pytest.mark.medium
 def test_who_takes_no_answer_keeps_nobody_out(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.viewer.clients.GRACE", 0.2)
-    monkeypatch.setattr("advsearch.viewer.server.list_page", lambda _: "x" * (64 << 20))
+    monkeypatch.setattr("advsearch.viewer.clients.SLOW_CLIENT_SECONDS", 0.2)
+    monkeypatch.setattr("advsearch.viewer.server.make_list_page", lambda _: "x" * (64 << 20))
     with serving(run) as server, ExitStack() as stack:
-        for _ in range(clients.WORKERS):
+        for _ in range(clients.N_WORKERS):
             talk = stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 60))
             talk.sendall(f"GET / HTTP/1.0\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode())
         assert ask(server, "/runs/first/cover")[0].status == 200
@@ -383,13 +383,13 @@ def test_a_page_of_many_scripts_is_looked_through_once(part: bytes) -> None:
 
 def test_scripts_of_a_page_are_those_that_are_named() -> None:
     with pytest.raises(ValueError, match="expected one of SCRIPTS"):
-        document("a page", scripts=["make.js"])
+        make_document("a page", scripts=["make.js"])
 
 
 def test_a_photograph_of_one_run_needs_its_own_key(run: Path) -> None:
     with serving(run) as server:
-        assert server.key("first") != server.key("second")
-        assert server.key("first").encode() not in ask(server, "/")[1] + ask(server, "/runs/first/")[1]
+        assert server.make_key("first") != server.make_key("second")
+        assert server.make_key("first").encode() not in ask(server, "/")[1] + ask(server, "/runs/first/")[1]
 
 
 def test_a_bad_run_does_not_take_the_list_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -413,7 +413,7 @@ def test_a_bad_run_does_not_take_the_list_along(tmp_path: Path, monkeypatch: pyt
 
 
 def test_an_error_of_our_own_is_an_answer(server: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.viewer.server.cover", lambda _: 1 / 0)
+    monkeypatch.setattr("advsearch.viewer.server.make_cover", lambda _: 1 / 0)
     answer, said = ask(server, "/runs/first/cover")
     assert (answer.status, said) == (
         500,

@@ -16,8 +16,8 @@ from advsearch.questions.stability.result import StabilityResult
 from advsearch.report.views import fields_shown
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Result, StudyResult
-from advsearch.viewer.document import heading
-from advsearch.viewer.pages import shown_page, write_page
+from advsearch.viewer.document import make_header
+from advsearch.viewer.pages import make_view_page, write_page
 from samples import ACCURACY, AVERAGE, CURVE, RECIPE, STABILITY, curve, make_run, matrix, region
 from stored_sweeps import serving
 
@@ -108,7 +108,7 @@ def test_a_recipe_leads_to_its_runs(tmp_path: Path) -> None:
 
 def test_only_words_that_are_shown_are_explained(tmp_path: Path) -> None:
     result = StabilityResult.of(STABILITY)
-    page = shown_page(tmp_path, result, fields_shown(result))
+    page = make_view_page(tmp_path, result, fields_shown(result))
     meanings = page[page.index("What these words mean") :]
     assert "every picture and gradient was finite" in meanings
     assert "cases that were not begun" not in meanings
@@ -167,9 +167,9 @@ def test_the_dashboard_and_a_bundle_have_the_pages_of_the_attacks(tmp_path: Path
 def test_notes_on_files_stand_outside_of_the_yellow_box() -> None:
     notes = ["My Car.OBJ: 12 faces without area were removed", "a.hdr, b.exr: the object stands on the scene's table"]
     weighty = "The worst margin still moved with the sample count: noise may take part in it."
-    shown = str(heading("sweep", "Right in 7 of 8.", [notes[0], weighty, notes[1]]))
+    shown = str(make_header("sweep", "Right in 7 of 8.", [notes[0], weighty, notes[1]]))
     assert shown.index('class="remarks"') < shown.index("worst margin") < shown.index('class="notes"')
     assert all(shown.index('class="notes"') < shown.index(one.partition(":")[0]) for one in notes)
     assert "<details>" not in shown
-    folded = str(heading("sweep", "Right in 7 of 8.", [f"{k}.ply: nothing" for k in range(4)]))
+    folded = str(make_header("sweep", "Right in 7 of 8.", [f"{k}.ply: nothing" for k in range(4)]))
     assert "<summary>4 notes on how files were read</summary>" in folded and "remarks" not in folded

@@ -9,18 +9,23 @@ from typing import Any
 from advsearch.attacks.candidates import (
     Failures,
     FoundFailure,
-    failure_share,
-    most_different,
+    estimate_failure_rate,
+    select_diverse,
 )
-from advsearch.attacks.domain import Domain, centre_of_option, half_widths, wraps
+from advsearch.attacks.domain import (
+    Domain,
+    compute_half_widths,
+    find_periodic,
+    option_center,
+)
 from advsearch.attacks.evaluation import (
     Evaluated,
     Evaluation,
     Policy,
     Proposal,
     draw_seed,
-    one_thread,
     seeded,
+    use_one_thread,
 )
 from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts, WithoutAscent
 from advsearch.attacks.policies.choices import Choices
@@ -28,10 +33,10 @@ from advsearch.attacks.policies.evolution import CMAES, NES
 from advsearch.attacks.policies.pgd import PGD, Adam
 from advsearch.attacks.policies.sampling import Grid, Random, Sobol
 from advsearch.attacks.policies.surrogate import (
-    MOST_OWN,
-    Observed,
+    MAX_SCALED_DIM,
+    Observations,
     Surrogate,
-    box_coordinates,
+    find_box_coordinates,
 )
 from advsearch.catalog import list_built_ins
 from advsearch.errors import InputError, UnknownNameError
@@ -103,7 +108,7 @@ def _nested(spec: Spec, where: str) -> Policy[Any]:
 
 __all__ = [
     "CMAES",
-    "MOST_OWN",
+    "MAX_SCALED_DIM",
     "NES",
     "PGD",
     "POLICIES",
@@ -116,7 +121,7 @@ __all__ = [
     "Failures",
     "FoundFailure",
     "Grid",
-    "Observed",
+    "Observations",
     "Policy",
     "Portfolio",
     "Proposal",
@@ -126,14 +131,14 @@ __all__ = [
     "Spec",
     "Surrogate",
     "WithoutAscent",
-    "box_coordinates",
-    "centre_of_option",
+    "compute_half_widths",
     "draw_seed",
-    "failure_share",
-    "half_widths",
+    "estimate_failure_rate",
+    "find_box_coordinates",
+    "find_periodic",
     "make_policy",
-    "most_different",
-    "one_thread",
+    "option_center",
     "seeded",
-    "wraps",
+    "select_diverse",
+    "use_one_thread",
 ]

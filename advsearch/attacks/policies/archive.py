@@ -55,16 +55,16 @@ class ArchiveState:
 
     domain: policies.Domain
     seed: int
-    spanned: Tensor
-    half: Tensor
+    measure_indices: Tensor
+    half_widths: Tensor
     archive: Any
     generation: int
     points: Tensor
     values: tuple[float, ...] = ()
-    wrong: tuple[bool, ...] = ()
-    seen: policies.Observed | None = None
+    successes: tuple[bool, ...] = ()
+    observations: policies.Observations | None = None
 
-    def kept(self) -> ArchiveState:
+    def add_generation(self) -> ArchiveState:
         """Return the state with a copy of the archive that has the generation so far.
 
         What could not be evaluated has no cell.
@@ -74,16 +74,16 @@ class ArchiveState:
         archive = copy.deepcopy(self.archive)
         if is_finite.any():
             points = self.points[: len(objectives)][torch.from_numpy(is_finite)]
-            measures = points[:, self.spanned].double().numpy()
+            measures = points[:, self.measure_indices].double().numpy()
             archive.add(
                 points.numpy(),
                 objectives[is_finite],
                 measures,
-                wrong=np.array(self.wrong)[is_finite],
+                wrong=np.array(self.successes)[is_finite],
             )
         return replace(self, archive=archive)
 
-    def bred(self, samples: Tensor, rng: torch.Generator) -> Tensor:
+    def make_offspring(self, samples: Tensor, rng: torch.Generator) -> Tensor:
         """Return offspring (n, d) of the archive, which may be out of bounds.
 
         Each has two parents. Its options are those of the first, now and then of a
@@ -100,20 +100,20 @@ class ArchiveState:
         first = solutions[1 + winner, torch.arange(count)]
         second = solutions[0]
         noise = torch.randn(count, dim, generator=rng)
-        noise[:, self.spanned] *= WIDER
+        noise[:, self.measure_indices] *= WIDER
         line_step = LINE * torch.randn(count, 1, generator=rng)
         offspring: Tensor = (
-            first + SIGMA * self.half * noise + line_step * (second - first)
+            first + SIGMA * self.half_widths * noise + line_step * (second - first)
         )
         is_resampled = torch.rand(count, dim, generator=rng) < ANEW
-        for block, part in self.domain.parts():
+        for block, part in self.domain.list_block_slices():
             if block.options:
                 offspring[:, part] = torch.where(
                     is_resampled[:, part], samples[:, part], first[:, part]
                 )
         return offspring
 
-    def likeliest(
+    def select_most_promising(
         self, surrogate: policies.Surrogate, points: Tensor, count: int
     ) -> Tensor:
         """Return the most promising of the candidates (n, d), (count, d).
@@ -122,7 +122,7 @@ class ArchiveState:
         fail where nothing fails yet. Where something does, a larger objective than its
         own counts for `BETTER` as much.
         """
-        mean, deviation = surrogate.predict(surrogate.space.take(points))
+        mean, deviation = surrogate.predict(surrogate.space.from_configuration(points))
         elites = self.archive.data()
         objectives = torch.from_numpy(elites["objective"])
         is_wrong = torch.from_numpy(elites["wrong"])
@@ -134,7 +134,7 @@ class ArchiveState:
         threshold = float(
             wrong_objectives.min() if bool(is_wrong.any()) else objectives.max()
         )
-        measures = points[:, self.spanned].double().numpy()
+        measures = points[:, self.measure_indices].double().numpy()
         cells = self.archive.index_of(measures).tolist()
         to_beat = torch.tensor(
             [objective_of_cell.get(cell, threshold) for cell in cells]
@@ -249,10 +249,10 @@ class MapElites(Policy[ArchiveState]):
             domain.begin[None],
             domain.sample(policies.seeded(seed, 0), self.population - 1),
         ]
-        box = policies.box_coordinates(domain)
-        few = box.count == domain.dim <= policies.MOST_OWN
+        box = policies.find_box_coordinates(domain)
+        few = box.count == domain.dim <= policies.MAX_SCALED_DIM
         seen = (
-            policies.Observed(box, torch.empty(0, box.count), memory=MEMORY)
+            policies.Observations(box, torch.empty(0, box.count), memory=MEMORY)
             if few
             else None
         )
@@ -260,11 +260,11 @@ class MapElites(Policy[ArchiveState]):
             domain,
             seed,
             spanned,
-            policies.half_widths(domain),
+            policies.compute_half_widths(domain),
             archive,
             0,
             torch.cat(first),
-            seen=seen,
+            observations=seen,
         )
 
     def propose(
@@ -278,25 +278,31 @@ class MapElites(Policy[ArchiveState]):
         self, state: ArchiveState, evaluated: policies.Evaluated
     ) -> ArchiveState:
         values = (*state.values, *(evaluation.objective for _, evaluation in evaluated))
-        wrong = (*state.wrong, *(evaluation.success for _, evaluation in evaluated))
-        seen = None if state.seen is None else state.seen.extended(evaluated)
-        state = replace(state, values=values, wrong=wrong, seen=seen)
-        return state if len(values) < len(state.points) else self._next(state.kept())
+        wrong = (*state.successes, *(evaluation.success for _, evaluation in evaluated))
+        seen = (
+            None if state.observations is None else state.observations.extend(evaluated)
+        )
+        state = replace(state, values=values, successes=wrong, observations=seen)
+        return (
+            state
+            if len(values) < len(state.points)
+            else self._next(state.add_generation())
+        )
 
     def failures(self, state: ArchiveState) -> policies.Failures:
         """Return the cells whose configuration is a success.
 
         Those of a generation that is not complete yet count.
         """
-        archive = state.kept().archive
-        measure_indices = tuple(state.spanned.tolist())
+        archive = state.add_generation().archive
+        measure_indices = tuple(state.measure_indices.tolist())
         elites = archive.data()
         wrong = np.flatnonzero(elites["wrong"])
         grid_indices = archive.int_to_grid_index(elites["index"][wrong])
         objectives = elites["objective"][wrong].tolist()
-        is_periodic = policies.wraps(state.domain)[state.spanned]
-        is_discrete = state.domain.options[state.spanned] > 0
-        chosen = policies.most_different(
+        is_periodic = policies.find_periodic(state.domain)[state.measure_indices]
+        is_discrete = state.domain.options[state.measure_indices] > 0
+        chosen = policies.select_diverse(
             torch.from_numpy(grid_indices / archive.dims),
             objectives,
             is_periodic,
@@ -325,34 +331,38 @@ class MapElites(Policy[ArchiveState]):
 
     def _next(self, state: ArchiveState) -> ArchiveState:
         """Begin the next generation; no other state has the archive yet."""
-        state = replace(state, generation=state.generation + 1, values=(), wrong=())
+        state = replace(state, generation=state.generation + 1, values=(), successes=())
         domain = state.domain
         rng = policies.seeded(state.seed, state.generation)
         if state.archive.empty:
             return replace(state, points=domain.sample(rng, self.population))
         n_new = int((torch.rand(self.population, generator=rng) < ANEW).sum())
         samples = domain.sample(rng, self.population)
-        observations = state.seen
+        observations = state.observations
         if observations is None:
-            offspring = [domain.project(u) for u in state.bred(samples[n_new:], rng)]
+            offspring = [
+                domain.project(u) for u in state.make_offspring(samples[n_new:], rng)
+            ]
             return replace(state, points=torch.stack([*samples[:n_new], *offspring]))
-        with policies.one_thread():
-            surrogate, observations = observations.surrogate()
+        with policies.use_one_thread():
+            surrogate, observations = observations.fit_surrogate()
             box = observations.space
             uniform = torch.rand(CANDIDATES, box.count, generator=rng)
             candidates = box.low + box.width * uniform
-            offspring_points = state.bred(candidates, rng)
+            offspring_points = state.make_offspring(candidates, rng)
             # Some are moved to any cell.
             n_moved = int(ELSEWHERE * CANDIDATES)
-            offspring_points[:n_moved, state.spanned] = candidates[
-                :n_moved, state.spanned
+            offspring_points[:n_moved, state.measure_indices] = candidates[
+                :n_moved, state.measure_indices
             ]
-            x = box.tidy((offspring_points - box.low) / box.width)
-            points = state.likeliest(
-                surrogate, box.put(offspring_points, x), self.population - n_new
+            x = box.normalize((offspring_points - box.low) / box.width)
+            points = state.select_most_promising(
+                surrogate,
+                box.to_configuration(offspring_points, x),
+                self.population - n_new,
             )
         points = torch.cat([samples[:n_new], points])
-        return replace(state, points=points, seen=observations)
+        return replace(state, points=points, observations=observations)
 
     def _spanned(self, domain: policies.Domain) -> Tensor:
         """Return the indices (k,) of the parameters that span the archive."""

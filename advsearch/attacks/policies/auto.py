@@ -21,27 +21,38 @@ from advsearch.attacks.evaluation import (
     Proposal,
     WhichGradient,
     draw_seed,
-    one_thread,
     seeded,
+    use_one_thread,
 )
-from advsearch.attacks.policies.choices import Race, Raced, line_up, with_choices
+from advsearch.attacks.policies.choices import (
+    Race,
+    RacingPolicy,
+    start_race,
+    wrap_choices,
+)
 from advsearch.attacks.policies.evolution import CMAES
 from advsearch.attacks.policies.pgd import PGD, Ascent
-from advsearch.attacks.policies.surrogate import Coordinates, Observed, box_coordinates
+from advsearch.attacks.policies.surrogate import (
+    BoxCoordinates,
+    Observations,
+    find_box_coordinates,
+)
 from advsearch.errors import InputError
 
 # share of the renders that the screen takes, in a box alone and beside a norm ball
-SCREEN = 0.5
-SCREEN_MIXED = 0.25
-UNTIL = 0.75  # share of the renders after which an ascent takes over, if there is one
-UNTIL_MIXED = 0.5
-LOW = 10
+SCREEN_FRACTION = 0.5
+SCREEN_FRACTION_MIXED = 0.25
+ASCENT_START = (
+    0.75  # share of the renders after which an ascent takes over, if there is one
+)
+ASCENT_START_MIXED = 0.5
+LOW_DIM = 10
 """Up to so many box coordinates are worth the whole screen. Of more it sees less and
 less, so if gradients cost nothing its share shrinks in proportion and the ascent
 follows at once.
 """
 
-PAYS = 4
+MIN_DERIVATIVES_PER_RENDER = 4
 """Beside no norm ball, a gradient is worth its renders if it brings so many numbers for
 each, and so many gradients fit into the ascent. One by differences never is: half a
 number for each, and the surrogate was better on average.
@@ -49,67 +60,69 @@ number for each, and the surrogate was better on average.
 
 # the ascent's whole step in a box, as a share of half the diagonal: the screen has been
 # everywhere else
-REACH = 0.1
-MOMENTUM = 0.75
-MOMENTUM_DRAWN = 0.95
+ASCENT_REACH = 0.1
+EXACT_MOMENTUM = 0.75
+RANDOM_CONDITIONS_MOMENTUM = 0.95
 """Weight of past gradients where none has noise and all point the same way, and where
 each sees other conditions; with noise PGD's own is better.
 """
 
-CURIOSITY = 2.0
+UCB_KAPPA = 2.0
 """How many standard deviations of the surrogate a candidate gets on top of its mean.
 One does as well without noise; with a noise as large as all differences it settles too
 soon on a lucky point.
 """
 
 # candidates near the best points, candidates anywhere, and the number of best points
-NEAR = 256
-FAR = 128
-CENTRES = 4
-NEVER = 1 << 30  # renders of a gradient that no search can pay
+N_NEAR_CANDIDATES = 256
+N_FAR_CANDIDATES = 128
+N_CENTERS = 4
+UNAFFORDABLE_COST = 1 << 30  # renders of a gradient that no search can pay
 
 
 @dataclass(frozen=True)
-class Spending:
+class BudgetPlan:
     """What the renders are for: the screen; the ascent, which asks for `gradient`,
-    begins after `until`, or never at `steps`.
+    begins after `ascent_start`, or never at `steps`.
     """
 
     steps: int
     screen: int
-    until: int
+    ascent_start: int
     gradient: WhichGradient
 
 
-def make_plan(domain: Domain, box: Coordinates, steps: int) -> Spending:
+def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
     if box.count == 0:
-        return Spending(steps, 0, 0, True)
+        return BudgetPlan(steps, 0, 0, True)
     if box.count < domain.dim:
-        screen = math.ceil(SCREEN_MIXED * steps)
-        until = math.ceil(UNTIL_MIXED * steps)
-        return Spending(
+        screen = math.ceil(SCREEN_FRACTION_MIXED * steps)
+        until = math.ceil(ASCENT_START_MIXED * steps)
+        return BudgetPlan(
             steps,
             screen,
             until,
             "free" if domain.gradient_cost and domain.partial_gradients else True,
         )
     n_continuous = int((box.options == 0).sum())
-    screen = math.ceil(SCREEN * steps * min(1.0, LOW / max(n_continuous, 1)))
-    until = math.ceil(UNTIL * steps) if n_continuous <= LOW else screen
+    screen = math.ceil(
+        SCREEN_FRACTION * steps * min(1.0, LOW_DIM / max(n_continuous, 1))
+    )
+    until = math.ceil(ASCENT_START * steps) if n_continuous <= LOW_DIM else screen
     cost = domain.gradient_cost
     if (
         n_continuous
-        and PAYS * cost <= n_continuous
-        and PAYS * (1 + cost) <= steps - until
+        and MIN_DERIVATIVES_PER_RENDER * cost <= n_continuous
+        and MIN_DERIVATIVES_PER_RENDER * (1 + cost) <= steps - until
     ):
-        return Spending(steps, screen, until, True)
-    return Spending(steps, math.ceil(SCREEN * steps), steps, True)
+        return BudgetPlan(steps, screen, until, True)
+    return BudgetPlan(steps, math.ceil(SCREEN_FRACTION * steps), steps, True)
 
 
 def _pgd(domain: Domain) -> PGD:
-    if domain.drawn:
-        return PGD(momentum=MOMENTUM_DRAWN)
-    return PGD(momentum=MOMENTUM) if domain.exact else PGD()
+    if domain.draws_conditions:
+        return PGD(momentum=RANDOM_CONDITIONS_MOMENTUM)
+    return PGD(momentum=EXACT_MOMENTUM) if domain.exact else PGD()
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,29 +131,29 @@ class AutoState:
     balls at their start, where the screen (m, k) looks next, the renders spent, and,
     once it has begun, the ascent of PGD, its latest objective and where the box
     coordinates stood before the latest proposal moved them at random, if it did
-    (`trial`).
+    (`box_before_trial`).
     """
 
     domain: Domain
-    seen: Observed
-    plan: Spending
+    observations: Observations
+    plan: BudgetPlan
     seed: int
     screen: Tensor
-    spent: int = 0
+    renders_spent: int = 0
     ascent: Ascent | None = None
-    climbing: bool = False
-    last: float = -math.inf
-    trial: Tensor | None = None
+    is_climbing: bool = False
+    latest_objective: float = -math.inf
+    box_before_trial: Tensor | None = None
 
     @property
-    def box(self) -> Coordinates:
-        return self.seen.space
+    def box(self) -> BoxCoordinates:
+        return self.observations.space
 
-    def at(self, x: Tensor) -> Tensor:
+    def to_configuration(self, x: Tensor) -> Tensor:
         """Return the configuration (d,) whose box coordinates are x and whose norm
         balls are at their start.
         """
-        return self.domain.project(self.box.put(self.domain.begin, x))
+        return self.domain.project(self.box.to_configuration(self.domain.begin, x))
 
 
 @dataclass(frozen=True)
@@ -152,11 +165,11 @@ class Auto(Policy[AutoState]):
     - Box coordinates alone (poses, cameras, lights, choices): the start and scrambled
       Sobol points take half of the renders. Then a Gaussian process is fitted to all
       that was seen, and the next point is the candidate with the largest mean plus
-      `CURIOSITY` standard deviations (GP-UCB, Srinivas et al. 2010), among moves of the
+      `UCB_KAPPA` standard deviations (GP-UCB, Srinivas et al. 2010), among moves of the
       best points, points anywhere, and the best point itself. The process models the
       noise, so a lucky value does not pass for a peak, and rendering the best point
       again is one of its choices. Where gradients cost no renders (adjoints), `PGD`
-      with small steps takes the last quarter; with more than `LOW` coordinates it
+      with small steps takes the last quarter; with more than `LOW_DIM` coordinates it
       begins right after a shorter screen.
     - Both: screen and surrogate over the box coordinates, with the balls at their
       start, take half of the renders and `PGD` over everything the rest. If the box
@@ -173,10 +186,10 @@ class Auto(Policy[AutoState]):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> AutoState:
-        box = box_coordinates(domain)
+        box = find_box_coordinates(domain)
         nothing = torch.empty(0, box.count)
         plan = make_plan(domain, box, steps)
-        seen = Observed(box, nothing)
+        seen = Observations(box, nothing)
         if box.count == 0:
             return AutoState(
                 domain,
@@ -187,106 +200,125 @@ class Auto(Policy[AutoState]):
                 ascent=_pgd(domain).start(domain, generator, steps),
             )
         seed = draw_seed(generator)
-        with one_thread():
-            screen = box.screen(seed, max(0, plan.screen - 1))
+        with use_one_thread():
+            screen = box.sample_screen(seed, max(0, plan.screen - 1))
         return AutoState(domain, seen, plan, seed, screen)
 
     def propose(
         self, state: AutoState, n: int
     ) -> tuple[tuple[Proposal, ...], AutoState]:
-        state = replace(state, climbing=False, trial=None)
-        if state.ascent is None and state.spent >= state.plan.until:
-            with one_thread():
+        state = replace(state, is_climbing=False, box_before_trial=None)
+        if state.ascent is None and state.renders_spent >= state.plan.ascent_start:
+            with use_one_thread():
                 state = self._begin_ascent(state)
         if state.ascent is not None:
             steps, ascent = _pgd(state.domain).propose(state.ascent, n)
             if steps:
                 (proposal,) = steps
                 proposal = replace(proposal, gradient=state.plan.gradient)
-                state = replace(state, climbing=True)
+                state = replace(state, is_climbing=True)
                 if proposal.gradient is True or ascent.count % 2 == 0:
                     return (proposal,), state
                 # only the balls have a gradient, so every second one moves in the box
                 # too
                 box = state.box
-                x = state.box.take(proposal.u)
-                moved = box.moves(
+                x = state.box.from_configuration(proposal.u)
+                moved = box.sample_moves(
                     x[None], seeded(state.seed, state.plan.steps + ascent.count)
                 )[0]
-                u = state.domain.project(box.put(proposal.u, moved))
-                return (replace(proposal, u=u),), replace(state, trial=x)
+                u = state.domain.project(box.to_configuration(proposal.u, moved))
+                return (replace(proposal, u=u),), replace(state, box_before_trial=x)
             if state.box.count < state.domain.dim:
                 return (), state
-        done = len(state.seen.values)
+        done = len(state.observations.values)
         us = [] if done else [state.domain.begin]
-        us += map(state.at, state.screen[max(0, done - 1) :][: n - len(us)])
+        us += map(
+            state.to_configuration, state.screen[max(0, done - 1) :][: n - len(us)]
+        )
         if not us:
-            with one_thread():
+            with use_one_thread():
                 x, state = self._next_point(state)
-            us = [state.at(x)]
+            us = [state.to_configuration(x)]
         return tuple(map(Proposal, us)), state
 
     def update(self, state: AutoState, evaluated: Evaluated) -> AutoState:
         state = replace(
             state,
-            spent=state.spent + sum(evaluation.cost for _, evaluation in evaluated),
+            renders_spent=state.renders_spent
+            + sum(evaluation.cost for _, evaluation in evaluated),
         )
-        if state.climbing and state.ascent is not None:
+        if state.is_climbing and state.ascent is not None:
             ((_, evaluation),) = evaluated
             ascent = _pgd(state.domain).update(state.ascent, evaluated)
-            if state.trial is not None and evaluation.objective < state.last:
-                u = state.domain.project(state.box.put(ascent.u, state.trial))
+            if (
+                state.box_before_trial is not None
+                and evaluation.objective < state.latest_objective
+            ):
+                u = state.domain.project(
+                    state.box.to_configuration(ascent.u, state.box_before_trial)
+                )
                 ascent = replace(ascent, u=u, counts=ascent.counts + Counts(rejected=1))
-            return replace(state, ascent=ascent, last=evaluation.objective)
-        return replace(state, seen=state.seen.extended(evaluated))
+            return replace(state, ascent=ascent, latest_objective=evaluation.objective)
+        return replace(state, observations=state.observations.extend(evaluated))
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:
-        plan = make_plan(domain, box_coordinates(domain), steps)
-        return domain.gradient_cost > 0 and plan.until < steps and plan.gradient is True
+        plan = make_plan(domain, find_box_coordinates(domain), steps)
+        return (
+            domain.gradient_cost > 0
+            and plan.ascent_start < steps
+            and plan.gradient is True
+        )
 
     def counts(self, state: AutoState) -> Counts:
         return NO_COUNTS if state.ascent is None else state.ascent.counts
 
     def _next_point(self, state: AutoState) -> tuple[Tensor, AutoState]:
         box = state.box
-        generator = seeded(state.seed, len(state.seen.values))
-        if not state.seen.finite:
-            return box.tidy(torch.rand(box.count, generator=generator)), state
-        surrogate, seen = state.seen.surrogate()
+        generator = seeded(state.seed, len(state.observations.values))
+        if not state.observations.has_finite:
+            return box.normalize(torch.rand(box.count, generator=generator)), state
+        surrogate, seen = state.observations.fit_surrogate()
         best = surrogate.x[
             surrogate.predict(surrogate.x)[0].argsort(descending=True, stable=True)
         ]
         centres = torch.randint(
-            0, min(CENTRES, len(best)), (NEAR,), generator=generator
+            0, min(N_CENTERS, len(best)), (N_NEAR_CANDIDATES,), generator=generator
         )
-        centres[: NEAR // 2] = 0
-        near = box.moves(best[centres], generator)
-        far = box.tidy(torch.rand(FAR, box.count, generator=generator))
+        centres[: N_NEAR_CANDIDATES // 2] = 0
+        near = box.sample_moves(best[centres], generator)
+        far = box.normalize(
+            torch.rand(N_FAR_CANDIDATES, box.count, generator=generator)
+        )
         candidates = torch.cat([best[:1], near, far])
         mean, deviation = surrogate.predict(candidates)
-        return candidates[int((mean + CURIOSITY * deviation).argmax())], replace(
-            state, seen=seen
+        return candidates[int((mean + UCB_KAPPA * deviation).argmax())], replace(
+            state, observations=seen
         )
 
     def _begin_ascent(self, state: AutoState) -> AutoState:
         """Let PGD go on from the best of the points seen so far, with small steps in
         the box.
         """
-        x = state.box.take(state.domain.begin)
+        x = state.box.from_configuration(state.domain.begin)
         blocks = state.domain.blocks
-        if state.seen.finite:
-            surrogate, seen = state.seen.surrogate()
-            state = replace(state, seen=seen)
+        if state.observations.has_finite:
+            surrogate, seen = state.observations.fit_surrogate()
+            state = replace(state, observations=seen)
             x = surrogate.x[int(surrogate.predict(surrogate.x)[0].argmax())]
         shortened = (
-            replace(block, reach=REACH * block.radius if block.norm == "box" else None)
+            replace(
+                block,
+                reach=ASCENT_REACH * block.radius if block.norm == "box" else None,
+            )
             for block in blocks
         )
         domain = replace(state.domain, blocks=tuple(shortened))
         ascent = _pgd(domain).start(
-            domain, seeded(state.seed, 0), max(1, state.plan.steps - state.spent)
+            domain,
+            seeded(state.seed, 0),
+            max(1, state.plan.steps - state.renders_spent),
         )
-        return replace(state, ascent=replace(ascent, u=state.at(x)))
+        return replace(state, ascent=replace(ascent, u=state.to_configuration(x)))
 
 
 @dataclass(frozen=True)
@@ -300,14 +332,16 @@ class WithoutAscent(Auto):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> AutoState:
-        return super().start(replace(domain, gradient_cost=NEVER), generator, steps)
+        return super().start(
+            replace(domain, gradient_cost=UNAFFORDABLE_COST), generator, steps
+        )
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:
         return False
 
 
 @dataclass(frozen=True)
-class Restarts(Raced[Race]):
+class Restarts(RacingPolicy[Race]):
     """Lets a policy search `times` times, each with an equal share of the renders; they
     take turns, step by step.
 
@@ -349,7 +383,7 @@ class Restarts(Raced[Race]):
             domain.begin,
             *(domain.sample(seeded(seed, number))[0] for number in range(1, count)),
         )
-        return line_up(
+        return start_race(
             [(self.policy, replace(domain, first=begin)) for begin in begins],
             steps,
             seed,
@@ -358,7 +392,7 @@ class Restarts(Raced[Race]):
 
 
 @dataclass(frozen=True)
-class Portfolio(Raced[Race]):
+class Portfolio(RacingPolicy[Race]):
     """Lets several policies search side by side and goes on with those that reached
     more.
 
@@ -402,7 +436,7 @@ class Portfolio(Raced[Race]):
         searches = []
         errors = []
         for policy in self.policies:
-            wrapped = with_choices(policy, domain)
+            wrapped = wrap_choices(policy, domain)
             try:
                 wrapped.start(
                     domain, seeded(seed, 0), max(1, steps // len(self.policies))
@@ -413,4 +447,4 @@ class Portfolio(Raced[Race]):
                 searches.append((wrapped, domain))
         if not searches:
             raise errors[0]
-        return line_up(searches, steps, seed)
+        return start_race(searches, steps, seed)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.candidates import Failures
-from advsearch.attacks.domain import Block, Distribution, Domain, centre_of_option
+from advsearch.attacks.domain import Block, Distribution, Domain, option_center
 from advsearch.attacks.evaluation import (
     NO_COUNTS,
     Counts,
@@ -35,15 +35,15 @@ from advsearch.attacks.policies.sampling import Random
 class Runner:
     """One search in a race: a policy and its state, renders left of its share of this
     round, the largest objective it has met, and whether it has nothing more to propose
-    (`over`).
+    (`is_over`).
     """
 
     policy: Policy[Any]
     domain: Domain
     state: Any
-    left: int = 0
-    best: float = -math.inf
-    over: bool = False
+    renders_left: int = 0
+    best_objective: float = -math.inf
+    is_over: bool = False
 
 
 Racing = TypeVar("Racing", bound="Race")
@@ -52,26 +52,28 @@ Racing = TypeVar("Racing", bound="Race")
 @dataclass(frozen=True, eq=False)
 class Race:
     """Where a race of so many steps and rounds stands: the numbers of those that are in
-    this round, the best first (`field`), renders that the evaluations so far took, and
-    the searches whose proposals wait for theirs (`asked`).
+    this round, the best first (`active_runners`), renders that the evaluations so far took, and
+    the searches whose proposals wait for theirs (`runner_of_proposal`).
     """
 
     runners: tuple[Runner, ...]
     steps: int
-    rounds: int
-    field: tuple[int, ...] = ()
+    n_rounds: int
+    active_runners: tuple[int, ...] = ()
     round: int = 0
     spent: int = 0
-    asked: tuple[int, ...] = ()
+    runner_of_proposal: tuple[int, ...] = ()
 
     @property
-    def leader(self) -> int:
+    def find_leader(self) -> int:
         """The number of the search that has met the largest objective so far, the first
         of equals.
         """
-        return max(range(len(self.runners)), key=lambda k: self.runners[k].best)
+        return max(
+            range(len(self.runners)), key=lambda k: self.runners[k].best_objective
+        )
 
-    def begun(self: Racing, field: Iterable[int], number: int) -> Racing:
+    def begin_round(self: Racing, field: Iterable[int], number: int) -> Racing:
         """Return the race at the beginning of a round.
 
         Args:
@@ -79,32 +81,34 @@ class Race:
             number: index of the round.
         """
         field = tuple(field)
-        rounds_left = self.rounds - number
+        rounds_left = self.n_rounds - number
         renders_each = max(1, (self.steps - self.spent) // rounds_left // len(field))
         runners = [
-            replace(runner, left=renders_each if index in field else 0)
+            replace(runner, renders_left=renders_each if index in field else 0)
             for index, runner in enumerate(self.runners)
         ]
-        return replace(self, runners=tuple(runners), field=field, round=number)
+        return replace(self, runners=tuple(runners), active_runners=field, round=number)
 
-    def asking(self: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
+    def propose(self: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
         """Return up to n proposals of this round that do not wait for each other.
 
         There are none where the round is over.
         """
         runners = list(self.runners)
-        waiting = [k for k in self.field if runners[k].left]
+        waiting = [k for k in self.active_runners if runners[k].renders_left]
         proposals_each = -(-n // max(1, len(waiting)))
         proposals = dict[int, tuple[Proposal, ...]]()
         n_used = Counter[int]()
         batch = list[Proposal]()
         runner_of_proposal = list[int]()
         while waiting and len(batch) < n:
-            k = max(waiting, key=lambda k: runners[k].left)  # the first of equals
+            k = max(
+                waiting, key=lambda k: runners[k].renders_left
+            )  # the first of equals
             if k not in proposals:
                 runner = runners[k]
                 proposals[k], state = runner.policy.propose(
-                    runner.state, min(proposals_each, runner.left)
+                    runner.state, min(proposals_each, runner.renders_left)
                 )
                 # The runner is changed only where its proposals are used.
                 proposer = replace(runner, state=state)
@@ -120,15 +124,19 @@ class Race:
                 batch.append(proposal)
                 runner_of_proposal.append(k)
                 n_used[k] += 1
-                renders_left = proposer.left - proposal.cost(proposer.domain)
-                runners[k] = replace(proposer, left=renders_left)
-            waiting = [k for k in self.field if runners[k].left]
+                renders_left = proposer.renders_left - proposal.max_cost(
+                    proposer.domain
+                )
+                runners[k] = replace(proposer, renders_left=renders_left)
+            waiting = [k for k in self.active_runners if runners[k].renders_left]
         for k, count in n_used.items():
             if count < len(proposals[k]):
                 # Its state must not count on more proposals than were used.
                 _, state = runners[k].policy.propose(self.runners[k].state, count)
                 runners[k] = replace(runners[k], state=state)
-        race = replace(self, runners=tuple(runners), asked=tuple(runner_of_proposal))
+        race = replace(
+            self, runners=tuple(runners), runner_of_proposal=tuple(runner_of_proposal)
+        )
         return tuple(batch), race
 
     def _retire(self, runners: list[Runner], k: int) -> None:
@@ -136,19 +144,19 @@ class Race:
 
         Its renders go to those that are left in the round.
         """
-        renders = runners[k].left
-        runners[k] = replace(runners[k], left=0, over=True)
-        others = [other for other in self.field if not runners[other].over]
+        renders = runners[k].renders_left
+        runners[k] = replace(runners[k], renders_left=0, is_over=True)
+        others = [other for other in self.active_runners if not runners[other].is_over]
         for other in others:
-            renders_left = runners[other].left + renders // len(others)
-            runners[other] = replace(runners[other], left=renders_left)
+            renders_left = runners[other].renders_left + renders // len(others)
+            runners[other] = replace(runners[other], renders_left=renders_left)
 
     def _limit_proposal(self, proposal: Proposal, runner: Runner) -> Proposal:
         """Return a proposal that the renders of its runner can pay."""
-        proposal = replace(proposal, samples=min(runner.left, proposal.samples))
+        proposal = replace(proposal, samples=min(runner.renders_left, proposal.samples))
         # Before the last round there will be renders to use a gradient.
-        has_later_round = self.round + 1 < self.rounds
-        return proposal.affordable(runner.domain, runner.left + has_later_round)
+        has_later_round = self.round + 1 < self.n_rounds
+        return proposal.limit_cost(runner.domain, runner.renders_left + has_later_round)
 
 
 def count_rounds(runners: int) -> int:
@@ -156,7 +164,7 @@ def count_rounds(runners: int) -> int:
     return 1 + (runners - 1).bit_length()
 
 
-def most_runners(steps: int, each: int, limit: int) -> int:
+def max_runners(steps: int, each: int, limit: int) -> int:
     """Return how many searches, at least 1 and at most `limit`, can have `each` renders
     in every round.
     """
@@ -166,7 +174,7 @@ def most_runners(steps: int, each: int, limit: int) -> int:
     return count
 
 
-def line_up(
+def start_race(
     searches: Sequence[tuple[Policy[Any], Domain]],
     steps: int,
     seed: int,
@@ -192,10 +200,10 @@ def line_up(
         )
         for number, (policy, domain) in enumerate(searches)
     )
-    return Race(runners, steps, rounds).begun(range(len(runners)), 0)
+    return Race(runners, steps, rounds).begin_round(range(len(runners)), 0)
 
 
-class Raced(Policy[Racing]):
+class RacingPolicy(Policy[Racing]):
     """A policy that is a race; its `start` lines it up."""
 
     def propose(self, state: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
@@ -203,19 +211,29 @@ class Raced(Policy[Racing]):
         this one is done.
         """
         while True:
-            batch, state = state.asking(n)
+            batch, state = state.propose(n)
             runners = state.runners
-            if batch or all(runner.over for runner in runners):
+            if batch or all(runner.is_over for runner in runners):
                 return batch, state
-            ranked = sorted(state.field, key=lambda k: runners[k].best, reverse=True)
+            ranked = sorted(
+                state.active_runners,
+                key=lambda k: runners[k].best_objective,
+                reverse=True,
+            )
             continuing = [
-                k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over
+                k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].is_over
             ]
             # nobody left who can go on: the rest is for whoever can
-            if state.round + 1 >= state.rounds or not continuing:
-                remaining = (k for k, runner in enumerate(runners) if not runner.over)
-                continuing = sorted(remaining, key=lambda k: -runners[k].best)[:1]
-            state = state.begun(continuing, min(state.round + 1, state.rounds - 1))
+            if state.round + 1 >= state.n_rounds or not continuing:
+                remaining = (
+                    k for k, runner in enumerate(runners) if not runner.is_over
+                )
+                continuing = sorted(
+                    remaining, key=lambda k: -runners[k].best_objective
+                )[:1]
+            state = state.begin_round(
+                continuing, min(state.round + 1, state.n_rounds - 1)
+            )
 
     def update(self, state: Racing, evaluated: Evaluated) -> Racing:
         """Update each search with the evaluations of its proposals.
@@ -224,7 +242,9 @@ class Raced(Policy[Racing]):
         proposals.
         """
         evaluated_by_runner = defaultdict[int, list[Any]](list)
-        for k, (u, evaluation) in zip(state.asked, evaluated, strict=False):
+        for k, (u, evaluation) in zip(
+            state.runner_of_proposal, evaluated, strict=False
+        ):
             evaluated_by_runner[k].append((u, evaluation))
         runners = list(state.runners)
         for k, runner_evaluated in evaluated_by_runner.items():
@@ -232,13 +252,17 @@ class Raced(Policy[Racing]):
             best = max(evaluation.objective for _, evaluation in runner_evaluated)
             runner_state = runner.policy.update(runner.state, runner_evaluated)
             runners[k] = replace(
-                runner, state=runner_state, best=max(runner.best, best)
+                runner,
+                state=runner_state,
+                best_objective=max(runner.best_objective, best),
             )
         spent = state.spent + sum(evaluation.cost for _, evaluation in evaluated)
-        return replace(state, runners=tuple(runners), spent=spent, asked=())
+        return replace(
+            state, runners=tuple(runners), spent=spent, runner_of_proposal=()
+        )
 
     def distribution(self, state: Racing) -> Distribution | None:
-        runner = state.runners[state.leader]
+        runner = state.runners[state.find_leader]
         return runner.policy.distribution(runner.state)
 
     def failures(self, state: Racing) -> Failures | None:
@@ -247,7 +271,7 @@ class Raced(Policy[Racing]):
         """
         known = [runner.policy.failures(runner.state) for runner in state.runners]
         return max(
-            filter(None, known), key=lambda failures: failures.found, default=None
+            filter(None, known), key=lambda failures: failures.n_failures, default=None
         )
 
     def counts(self, state: Racing) -> Counts:
@@ -273,7 +297,7 @@ class ChoicesState(Race):
     choices: Tensor
     combinations: Tensor
 
-    def whole(self, numbers: Tensor, combination: int) -> Tensor:
+    def join_choices(self, numbers: Tensor, combination: int) -> Tensor:
         u = self.domain.begin.clone()
         u[self.numbers] = numbers[: len(self.numbers)]
         u[self.choices] = self.combinations[combination]
@@ -281,7 +305,7 @@ class ChoicesState(Race):
 
 
 @dataclass(frozen=True)
-class Choices(Raced[ChoicesState]):
+class Choices(RacingPolicy[ChoicesState]):
     """Searches combinations of options outside and, with another policy, the numbers
     inside.
 
@@ -324,11 +348,11 @@ class Choices(Raced[ChoicesState]):
         counts = options[choices].tolist()
         each = 1 + (domain.gradient_cost if policy.uses_gradient else 0)
         limit = min(MOST, math.prod(counts), max(2, MOST_NUMBERS // domain.dim))
-        most = most_runners(steps, each, limit)
+        most = max_runners(steps, each, limit)
         combinations = _combinations(
             counts, domain.begin[choices], most, seeded(seed, 0)
         )
-        race = line_up([(policy, inner)] * len(combinations), steps, seed)
+        race = start_race([(policy, inner)] * len(combinations), steps, seed)
         return ChoicesState(
             **vars(race),
             domain=domain,
@@ -341,9 +365,9 @@ class Choices(Raced[ChoicesState]):
         self, state: ChoicesState, n: int
     ) -> tuple[tuple[Proposal, ...], ChoicesState]:
         proposals, state = super().propose(state, n)
-        asked = zip(proposals, state.asked, strict=True)
+        asked = zip(proposals, state.runner_of_proposal, strict=True)
         return tuple(
-            replace(proposal, u=state.whole(proposal.u, number))
+            replace(proposal, u=state.join_choices(proposal.u, number))
             for proposal, number in asked
         ), state
 
@@ -363,13 +387,15 @@ class Choices(Raced[ChoicesState]):
             return None
         deviation = torch.zeros_like(state.domain.start)
         deviation[state.numbers] = inner.deviation
-        return Distribution(state.whole(inner.mean, state.leader), deviation)
+        return Distribution(
+            state.join_choices(inner.mean, state.find_leader), deviation
+        )
 
     def failures(self, state: ChoicesState) -> None:
         """None: those of a search are without their choices."""
 
 
-def with_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
+def wrap_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
     """Return the policy, inside `Choices` if the domain has discrete choices that it
     does not handle itself.
     """
@@ -403,5 +429,5 @@ def _combinations(
                 )
             )
         picked = torch.tensor(sorted(seen - {first})).reshape(-1, len(counts))
-    middles = centre_of_option((picked + 0.5) / sizes, sizes)
+    middles = option_center((picked + 0.5) / sizes, sizes)
     return torch.cat([begin[None], middles.to(begin.dtype)])

@@ -18,14 +18,19 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.attacks.domain import Distribution, Domain, half_widths, wraps
+from advsearch.attacks.domain import (
+    Distribution,
+    Domain,
+    compute_half_widths,
+    find_periodic,
+)
 from advsearch.attacks.evaluation import (
     Evaluated,
     Policy,
     Proposal,
     draw_seed,
-    one_thread,
     seeded,
+    use_one_thread,
 )
 from advsearch.errors import InputError
 from advsearch.seeds import stream
@@ -147,7 +152,7 @@ class NES(Policy[NESState]):
         return NESState(
             domain,
             draw_seed(generator),
-            half_widths(domain),
+            compute_half_widths(domain),
             domain.begin,
             deviation,
             population,
@@ -215,7 +220,7 @@ def _own_random(seed: int, generation: int) -> Iterator[None]:
     before = np.random.get_state()  # noqa: NPY002
     np.random.seed(stream(seed, "pycma", generation))  # noqa: NPY002
     try:
-        with warnings.catch_warnings(), one_thread():
+        with warnings.catch_warnings(), use_one_thread():
             warnings.simplefilter("ignore")
             yield
     finally:
@@ -250,12 +255,12 @@ class CMAESState:
 
     @property
     def distribution(self) -> Distribution:
-        mean, _ = self.projected(np.asarray(self.strategy.mean))
+        mean, _ = self.project(np.asarray(self.strategy.mean))
         return Distribution(
             mean, torch.from_numpy(self.deviations).float() * self.scale
         )
 
-    def projected(self, x: Doubles) -> tuple[Tensor, float]:
+    def project(self, x: Doubles) -> tuple[Tensor, float]:
         """Return the configuration for coordinates x, and how far outside they lie:
         mean square over the elements.
         """
@@ -353,8 +358,8 @@ class CMAES(Policy[CMAESState]):
         population = self.population or 4 + int(3 * math.log(d))
         seed = draw_seed(generator)
         strategy = self._strategy(d, population, seed)
-        scale = half_widths(domain)
-        around = wraps(domain)
+        scale = compute_half_widths(domain)
+        around = find_periodic(domain)
         none = np.empty((0, d))
         return CMAESState(
             domain, seed, domain.begin, scale, around, strategy, 0, none
@@ -364,12 +369,12 @@ class CMAES(Policy[CMAESState]):
         self, state: CMAESState, n: int
     ) -> tuple[tuple[Proposal, ...], CMAESState]:
         points = state.points[len(state.values) :][:n]
-        return tuple(Proposal(state.projected(x)[0]) for x in points), state
+        return tuple(Proposal(state.project(x)[0]) for x in points), state
 
     def update(self, state: CMAESState, evaluated: Evaluated) -> CMAESState:
         values = [evaluation.objective for _, evaluation in evaluated]
         outside = [
-            state.projected(x)[1]
+            state.project(x)[1]
             for x in state.points[len(state.values) :][: len(values)]
         ]
         best = max(state.best, *values)

@@ -40,20 +40,20 @@ class Ranges:
     a number, and which (d,) are angles.
     """
 
-    counts: Tensor
-    around: Tensor
+    n_options: Tensor
+    is_periodic: Tensor
 
-    def away(self, x: Tensor, mean: Tensor) -> Tensor:
+    def compute_offset(self, x: Tensor, mean: Tensor) -> Tensor:
         """Return the offset of x from a mean; of an angle the shorter, within a half."""
         offset = x - mean
         wrapped_offset = torch.remainder(offset + 0.5, 1.0) - 0.5
-        return torch.where(self.around, wrapped_offset, offset)
+        return torch.where(self.is_periodic, wrapped_offset, offset)
 
-    def ends(self, mean: Tensor) -> tuple[Tensor, Tensor]:
+    def compute_bounds(self, mean: Tensor) -> tuple[Tensor, Tensor]:
         """Return the offsets of the lower and upper bound of each range from a mean."""
         half = torch.full_like(mean, 0.5)
-        lower = torch.where(self.around, -half, -mean)
-        upper = torch.where(self.around, half, 1.0 - mean)
+        lower = torch.where(self.is_periodic, -half, -mean)
+        upper = torch.where(self.is_periodic, half, 1.0 - mean)
         return lower, upper
 
 
@@ -69,35 +69,35 @@ class Components:
     deviations: Tensor
     options: Tensor
 
-    def logs(self, x: Tensor, ranges: Ranges) -> Tensor:
+    def compute_log_densities(self, x: Tensor, ranges: Ranges) -> Tensor:
         """Return the logarithms (n, k) of weight times density of each component.
 
         The density at x (n, d) is relative to the uniform density.
         """
-        lower_offset, upper_offset = ranges.ends(self.means)
+        lower_offset, upper_offset = ranges.compute_bounds(self.means)
         lower_cdf = torch.special.ndtr(lower_offset / self.deviations)
         upper_cdf = torch.special.ndtr(upper_offset / self.deviations)
-        scaled = ranges.away(x[:, None], self.means) / self.deviations
+        scaled = ranges.compute_offset(x[:, None], self.means) / self.deviations
         log_density = -0.5 * scaled.square() - torch.log(
             self.deviations * math.sqrt(2.0 * math.pi) * (upper_cdf - lower_cdf)
         )
-        option = (x * ranges.counts).long().clamp(max=self.options.shape[2] - 1)
+        option = (x * ranges.n_options).long().clamp(max=self.options.shape[2] - 1)
         probability = self.options.expand(len(x), *self.options.shape).gather(
             3, option[:, None, :, None].expand(-1, len(self.weights), -1, 1)
         )
         log_density = torch.where(
-            ranges.counts > 0,
-            torch.log(probability[..., 0] * ranges.counts.clamp(min=1)),
+            ranges.n_options > 0,
+            torch.log(probability[..., 0] * ranges.n_options.clamp(min=1)),
             log_density,
         )
         return self.weights.log() + log_density.sum(dim=2)
 
-    def draw(self, generator: torch.Generator, ranges: Ranges) -> Tensor:
+    def sample(self, generator: torch.Generator, ranges: Ranges) -> Tensor:
         """Return one sample (d,) of the mixture, in fractions of each range."""
         k = int(torch.multinomial(self.weights, 1, generator=generator))
         mean = self.means[k]
         deviation = self.deviations[k]
-        lower_offset, upper_offset = ranges.ends(mean)
+        lower_offset, upper_offset = ranges.compute_bounds(mean)
         lower_cdf = torch.special.ndtr(lower_offset / deviation)
         upper_cdf = torch.special.ndtr(upper_offset / deviation)
         uniform = torch.rand(len(mean), generator=generator, dtype=torch.float64)
@@ -105,12 +105,12 @@ class Components:
         x = mean + deviation * torch.special.ndtri(cdf)
         wrapped = torch.remainder(x, 1.0)
         clipped = x.nan_to_num(0.5).clamp(0.0, 1.0)
-        x = torch.where(ranges.around, wrapped, clipped)
+        x = torch.where(ranges.is_periodic, wrapped, clipped)
         option = torch.multinomial(self.options[k], 1, generator=generator)[:, 0]
-        option_center = (option + 0.5) / ranges.counts.clamp(min=1)
-        return torch.where(ranges.counts > 0, option_center, x)
+        option_center = (option + 0.5) / ranges.n_options.clamp(min=1)
+        return torch.where(ranges.n_options > 0, option_center, x)
 
-    def maximised(
+    def maximize(
         self, x: Tensor, weights: Tensor, ranges: Ranges, even: Tensor
     ) -> Components:
         """Return the components after one step of expectation and maximisation.
@@ -121,10 +121,12 @@ class Components:
             ranges: of the elements.
             even: (k, d, most options) uniform probabilities of options, the prior.
         """
-        responsibility = self.logs(x, ranges).softmax(dim=1) * weights[:, None]
+        responsibility = (
+            self.compute_log_densities(x, ranges).softmax(dim=1) * weights[:, None]
+        )
         counts = responsibility.sum(dim=0)
         portion = (responsibility / counts.clamp(min=1e-12)).T
-        offset = ranges.away(x[:, None], self.means)
+        offset = ranges.compute_offset(x[:, None], self.means)
         shift = torch.einsum("kn,nkd->kd", portion, offset)
         spread = torch.einsum("kn,nkd->kd", portion, (offset - shift).square())
         component_counts = counts[:, None]
@@ -132,7 +134,7 @@ class Components:
             shift, spread, component_counts, ranges
         )
         one_hot_option = torch.nn.functional.one_hot(
-            (x * ranges.counts).long().clamp(max=even.shape[2] - 1), even.shape[2]
+            (x * ranges.n_options).long().clamp(max=even.shape[2] - 1), even.shape[2]
         )
         frequency = torch.einsum("kn,ndo->kdo", portion, one_hot_option.double())
         option_counts = component_counts[..., None]
@@ -160,7 +162,7 @@ class Components:
         means = self.means + shift
         tilted = deviations.square() * (means / variance - 0.5 / EVEN**2)
         means = torch.where(
-            ranges.around, torch.remainder(means, 1.0), tilted.clamp(0.0, 1.0)
+            ranges.is_periodic, torch.remainder(means, 1.0), tilted.clamp(0.0, 1.0)
         )
         return means, deviations
 
@@ -176,30 +178,32 @@ class MixtureState:
         seed: of its random numbers.
         ranges: of the elements of u.
         generation: index of the present generation.
-        learnt: mixtures of the generations in the window; None of a uniform one.
+        mixtures: mixtures of the generations in the window; None of a uniform one.
         points: (n, d) samples of the present generation.
-        seen: (m, d) the latest `WINDOW` samples that were evaluated.
+        evaluated_points: (m, d) the latest `WINDOW` samples that were evaluated.
         log: (t, 5) of all samples: objective, failed, unknown, weight and largest
-            weight; see `failure_share`.
-        told: samples of the present generation that were evaluated.
+            weight; see `estimate_failure_rate`.
+        n_evaluated: samples of the present generation that were evaluated.
     """
 
     domain: policies.Domain
     seed: int
     ranges: Ranges
     generation: int
-    learnt: tuple[Components | None, ...]
+    mixtures: tuple[Components | None, ...]
     points: Tensor
-    seen: Tensor
+    evaluated_points: Tensor
     log: Tensor
-    told: int = 0
+    n_evaluated: int = 0
 
-    def configuration(self, x: Tensor) -> Tensor:
+    def to_configuration(self, x: Tensor) -> Tensor:
         """Return the configuration (d,) of x, which is in fractions of each range."""
         width = self.domain.upper - self.domain.lower
         return self.domain.project((self.domain.lower + x * width).float())
 
-    def telling(self, mixture: Components, k: int) -> dict[int, tuple[float, float]]:
+    def find_distinctive_ranges(
+        self, mixture: Components, k: int
+    ) -> dict[int, tuple[float, float]]:
         """Return the ranges that distinguish a component, by index in u.
 
         They reach two deviations to both sides, or are those of the most probable
@@ -208,14 +212,14 @@ class MixtureState:
         lower = self.domain.lower.double()
         width = (self.domain.upper - self.domain.lower).double()
         ranges: dict[int, tuple[float, float]] = {}
-        for index, n_options in enumerate(self.ranges.counts.tolist()):
+        for index, n_options in enumerate(self.ranges.n_options.tolist()):
             if n_options:
                 bounds = self._option_bounds(mixture.options[k, index], n_options)
             else:
                 bounds = self._number_bounds(
                     float(mixture.means[k, index]),
                     float(mixture.deviations[k, index]),
-                    is_periodic=bool(self.ranges.around[index]),
+                    is_periodic=bool(self.ranges.is_periodic[index]),
                 )
             if bounds is not None:
                 low, high = (float(lower[index] + x * width[index]) for x in bounds)
@@ -259,7 +263,7 @@ class Mixture(Policy[MixtureState]):
     density that they came from (the balance heuristic of Veach and Guibas 1995).
 
     Its result is a failure for each component, and with the share of all configurations
-    that fail: see `failure_share`. That share is of single renders with the search's
+    that fail: see `estimate_failure_rate`. That share is of single renders with the search's
     samples. In an l2 ball no share is told.
 
     Attributes:
@@ -298,7 +302,7 @@ class Mixture(Policy[MixtureState]):
                 f"policy 'mixture': expected at most {MOST} numbers, got "
                 f"{domain.dim}; use pgd or auto"
             )
-        ranges = Ranges(domain.options, policies.wraps(domain))
+        ranges = Ranges(domain.options, policies.find_periodic(domain))
         nothing = torch.empty(0, domain.dim, dtype=torch.float64)
         log = torch.empty(0, 5, dtype=torch.float64)
         state = MixtureState(
@@ -309,16 +313,16 @@ class Mixture(Policy[MixtureState]):
     def propose(
         self, state: MixtureState, n: int
     ) -> tuple[tuple[policies.Proposal, ...], MixtureState]:
-        next_points = state.points[state.told :][:n]
-        configurations = [state.configuration(x) for x in next_points]
+        next_points = state.points[state.n_evaluated :][:n]
+        configurations = [state.to_configuration(x) for x in next_points]
         return tuple(policies.Proposal(u) for u in configurations), state
 
     def update(
         self, state: MixtureState, evaluated: policies.Evaluated
     ) -> MixtureState:
-        points = state.points[state.told :][: len(evaluated)]
-        mixture = state.learnt[-1]
-        with policies.one_thread():
+        points = state.points[state.n_evaluated :][: len(evaluated)]
+        mixture = state.mixtures[-1]
+        with policies.use_one_thread():
             weights = (1.0 / self._density(mixture, points, state.ranges)).tolist()
         max_weight = 1.0 if mixture is None else 1.0 / self.even
         rows = [
@@ -334,17 +338,17 @@ class Mixture(Policy[MixtureState]):
         state = replace(
             state,
             log=torch.cat([state.log, torch.tensor(rows, dtype=torch.float64)]),
-            seen=torch.cat([state.seen, points]),
-            told=state.told + len(evaluated),
+            evaluated_points=torch.cat([state.evaluated_points, points]),
+            n_evaluated=state.n_evaluated + len(evaluated),
         )
-        if state.told < self.population:
+        if state.n_evaluated < self.population:
             return state
         return self._begin_generation(state, self._fit(state))
 
     def failures(self, state: MixtureState) -> policies.Failures:
         """Return a failure for each component that has some, and the failure rate."""
-        with policies.one_thread():
-            failure_rate = policies.failure_share(
+        with policies.use_one_thread():
+            failure_rate = policies.estimate_failure_rate(
                 state.log[:, 3],
                 state.log[:, 4],
                 state.log[:, 1] > 0,
@@ -363,10 +367,10 @@ class Mixture(Policy[MixtureState]):
 
     def _list_examples(self, state: MixtureState) -> tuple[policies.FoundFailure, ...]:
         """Return the worst failure in the window of each component that has some."""
-        log = state.log[-len(state.seen) :]
-        mixture = state.learnt[-1]
+        log = state.log[-len(state.evaluated_points) :]
+        mixture = state.mixtures[-1]
         is_failure = log[:, 1].bool() & ~log[:, 2].bool()
-        points = state.seen[is_failure]
+        points = state.evaluated_points[is_failure]
         objectives = log[is_failure, 0]
         if not len(points):
             return ()
@@ -374,7 +378,9 @@ class Mixture(Policy[MixtureState]):
         components = [0]
         if mixture is not None:
             weights = mixture.weights
-            component_of_point = mixture.logs(points, state.ranges).argmax(dim=1)
+            component_of_point = mixture.compute_log_densities(
+                points, state.ranges
+            ).argmax(dim=1)
             components = sorted(
                 set(component_of_point.tolist()), key=lambda k: -float(weights[k])
             )
@@ -382,8 +388,10 @@ class Mixture(Policy[MixtureState]):
         for k in components:
             members = (component_of_point == k).nonzero().flatten()
             worst = int(members[objectives[members].argmax()])
-            u = state.configuration(points[worst])
-            ranges = {} if mixture is None else state.telling(mixture, k)
+            u = state.to_configuration(points[worst])
+            ranges = (
+                {} if mixture is None else state.find_distinctive_ranges(mixture, k)
+            )
             examples.append(policies.FoundFailure(u, float(objectives[worst]), ranges))
         return tuple(examples)
 
@@ -396,34 +404,36 @@ class Mixture(Policy[MixtureState]):
         """
         number = state.generation + 1
         rng = policies.seeded(state.seed, number)
-        n_options = state.ranges.counts
+        n_options = state.ranges.n_options
         points = torch.rand(
             self.population, len(n_options), generator=rng, dtype=torch.float64
         )
         points = torch.where(
             n_options > 0,
-            policies.centre_of_option(points, n_options.clamp(min=1)),
+            policies.option_center(points, n_options.clamp(min=1)),
             points,
         )
         for row in range(self.population):
             if mixture is not None and float(torch.rand(1, generator=rng)) >= self.even:
-                points[row] = mixture.draw(rng, state.ranges)
+                points[row] = mixture.sample(rng, state.ranges)
         window = WINDOW // self.population * self.population or self.population
         n_generations = window // self.population + 1
         return replace(
             state,
             generation=number,
             points=points,
-            learnt=(*state.learnt, mixture)[-n_generations:],
-            seen=state.seen[-window:],
-            told=0,
+            mixtures=(*state.mixtures, mixture)[-n_generations:],
+            evaluated_points=state.evaluated_points[-window:],
+            n_evaluated=0,
         )
 
     def _density(self, mixture: Components | None, x: Tensor, ranges: Ranges) -> Tensor:
         """Return the density (n,) of a generation at x (n, d), relative to uniform."""
         if mixture is None:
             return torch.ones(len(x), dtype=torch.float64)
-        mixture_density = mixture.logs(x, ranges).logsumexp(dim=1).exp()
+        mixture_density = (
+            mixture.compute_log_densities(x, ranges).logsumexp(dim=1).exp()
+        )
         return self.even + (1.0 - self.even) * mixture_density
 
     def _fit(self, state: MixtureState) -> Components | None:
@@ -431,24 +441,24 @@ class Mixture(Policy[MixtureState]):
 
         None where nothing could be evaluated.
         """
-        log = state.log[-len(state.seen) :]
+        log = state.log[-len(state.evaluated_points) :]
         ranges = state.ranges
         is_elite = self._find_elite(log)
-        points = state.seen[is_elite]
+        points = state.evaluated_points[is_elite]
         if not len(points):
             return None
-        with policies.one_thread():
+        with policies.use_one_thread():
             densities = [
-                self._density(mixture, points, ranges) for mixture in state.learnt
+                self._density(mixture, points, ranges) for mixture in state.mixtures
             ]
             weights = 1.0 / torch.stack(densities).mean(dim=0)
             # scaled to have the effective sample size as their sum
             weights *= weights.sum() / weights.square().sum()
-            center_index = policies.most_different(
+            center_index = policies.select_diverse(
                 points,
                 log[is_elite, 0].tolist(),
-                ranges.around,
-                ranges.counts > 0,
+                ranges.is_periodic,
+                ranges.n_options > 0,
                 self.components,
             )
             means = points[center_index]
@@ -460,7 +470,7 @@ class Mixture(Policy[MixtureState]):
                 even,
             )
             for _ in range(ROUNDS):
-                mixture = mixture.maximised(points, weights, ranges, even)
+                mixture = mixture.maximize(points, weights, ranges, even)
         return mixture
 
     @staticmethod
@@ -481,8 +491,8 @@ class Mixture(Policy[MixtureState]):
     @staticmethod
     def _uniform_options(n_components: int, ranges: Ranges) -> Tensor:
         """Return uniform probabilities of options, (k, d, most options)."""
-        n_elements = len(ranges.counts)
-        max_options = max(1, int(ranges.counts.max()))
+        n_elements = len(ranges.n_options)
+        max_options = max(1, int(ranges.n_options.max()))
         options = torch.ones(n_components, n_elements, max_options, dtype=torch.float64)
-        options *= torch.arange(max_options) < ranges.counts.clamp(min=1)[:, None]
+        options *= torch.arange(max_options) < ranges.n_options.clamp(min=1)[:, None]
         return options / options.sum(dim=2, keepdim=True)

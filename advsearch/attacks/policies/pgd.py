@@ -14,7 +14,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from advsearch.attacks.domain import Domain, half_widths
+from advsearch.attacks.domain import Domain, compute_half_widths
 from advsearch.attacks.evaluation import (
     NO_COUNTS,
     Counts,
@@ -48,11 +48,11 @@ def clipped(
     shortened to that.
     - In a domain that is `exact` or `drawn` nothing is an outlier.
     """
-    if domain.exact or domain.drawn:
+    if domain.exact or domain.draws_conditions:
         return gradient, lengths, NO_COUNTS
     out = gradient.clone()
     cut = False
-    for block, part in domain.parts():
+    for block, part in domain.list_block_slices():
         if (
             block.norm != "box"
             and block.size >= FEWEST_NUMBERS
@@ -166,7 +166,7 @@ class Ascent:
     """Where an ascent of so many evaluations stands: u (d,) to propose next, the
     accumulated gradient (d,), of Adam its mean and the mean (d,) of squares, the step
     size, the best evaluation, evaluations so far (`count`), gradients in these means
-    (`taken`), zero gradients in a row (`flat`), and lengths of gradients as `clipped`
+    (`n_steps_taken`), zero gradients in a row (`flat`), and lengths of gradients as `clipped`
     wants them. PGD has besides the objective at the start, a window, and windows in a
     row that added nothing (`idle`, without noise only).
     """
@@ -180,7 +180,7 @@ class Ascent:
     square: Tensor = NOTHING
     peak: Peak | None = None
     count: int = 0
-    taken: int = 0
+    n_steps_taken: int = 0
     flat: int = 0
     lengths: tuple[float, ...] = ()
     counts: Counts = NO_COUNTS
@@ -193,7 +193,7 @@ class Ascent:
         return self.step_size * max(SLOWEST, 1.0 - number / self.steps)
 
 
-class Climbing(Policy[Ascent]):
+class AscentPolicy(Policy[Ascent]):
     """A policy that follows gradients, one evaluation after the other."""
 
     uses_gradient: ClassVar[bool] = True
@@ -206,7 +206,7 @@ class Climbing(Policy[Ascent]):
     def update(self, state: Ascent, evaluated: Evaluated) -> Ascent:
         ((u, evaluation),) = evaluated
         state = replace(state, count=state.count + 1)
-        if not evaluation.finite:
+        if not evaluation.is_finite:
             counts = state.counts + Counts(rejected=1)
             return self.retreat(
                 replace(state, step_size=state.step_size / 2, counts=counts)
@@ -224,7 +224,9 @@ class Climbing(Policy[Ascent]):
             )
             if bool(gradient.any()):
                 state = replace(
-                    self.learn(state, gradient), taken=state.taken + 1, flat=0
+                    self.learn(state, gradient),
+                    n_steps_taken=state.n_steps_taken + 1,
+                    flat=0,
                 )
         if state.peak is None or evaluation.objective > state.peak.objective:
             state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
@@ -261,7 +263,7 @@ class Climbing(Policy[Ascent]):
 
 
 @dataclass(frozen=True)
-class PGD(Climbing):
+class PGD(AscentPolicy):
     """Projected gradient ascent (Madry et al. 2018) for a noisy objective.
 
     One step, with P the projection onto the domain and `steepest` the sign of a vector
@@ -330,7 +332,7 @@ class PGD(Climbing):
     def pace(self, state: Ascent) -> float:
         return (
             state.falling(state.count)
-            if state.domain.exact or state.domain.drawn
+            if state.domain.exact or state.domain.draws_conditions
             else state.step_size
         )
 
@@ -352,7 +354,7 @@ class PGD(Climbing):
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
         if math.isnan(state.first):
             state = replace(state, first=objective)
-        if state.domain.drawn:
+        if state.domain.draws_conditions:
             return self._moved(state, u)
         window = state.window.add(objective)
         peak = state.peak
@@ -395,7 +397,7 @@ class PGD(Climbing):
 
 
 @dataclass(frozen=True)
-class Adam(Climbing):
+class Adam(AscentPolicy):
     """Adam (Kingma and Ba 2015, algorithm 1) uphill, projected onto the domain after
     every step:
 
@@ -447,12 +449,12 @@ class Adam(Climbing):
     def retreat(self, state: Ascent) -> Ascent:
         u = state.domain.begin if state.peak is None else state.peak.u
         return replace(
-            state, u=u, direction=torch.zeros_like(u), square=NOTHING, taken=0
+            state, u=u, direction=torch.zeros_like(u), square=NOTHING, n_steps_taken=0
         )
 
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
         squares = gradient.square()
-        for block, part in state.domain.parts():
+        for block, part in state.domain.list_block_slices():
             if block.norm == "l2":
                 squares[part] = squares[part].mean()
         mean = torch.lerp(gradient, state.direction, self.beta1)
@@ -461,10 +463,10 @@ class Adam(Climbing):
         )
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
-        if state.taken:
-            mean = state.direction / (1.0 - self.beta1**state.taken)
+        if state.n_steps_taken:
+            mean = state.direction / (1.0 - self.beta1**state.n_steps_taken)
             way = mean / (
-                state.square / (1.0 - self.beta2**state.taken)
+                state.square / (1.0 - self.beta2**state.n_steps_taken)
             ).sqrt_().clamp_(min=1e-30)
         else:  # at random as long as nothing is known
             way = torch.randn(
@@ -475,6 +477,6 @@ class Adam(Climbing):
         return replace(
             state,
             u=state.domain.project(
-                torch.addcmul(u, half_widths(state.domain), way, value=rate)
+                torch.addcmul(u, compute_half_widths(state.domain), way, value=rate)
             ),
         )

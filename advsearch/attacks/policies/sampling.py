@@ -13,7 +13,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.attacks.domain import Block, Domain, centre_of_option
+from advsearch.attacks.domain import Block, Domain, option_center
 from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.errors import InputError
 
@@ -36,16 +36,14 @@ class PointsState:
     domain: Domain
     seed: int = 0
     points: Tensor = NONE
-    done: int = 0
+    n_proposed: int = 0
 
-    def proposing(
-        self, us: Iterable[Tensor]
-    ) -> tuple[tuple[Proposal, ...], PointsState]:
+    def propose(self, us: Iterable[Tensor]) -> tuple[tuple[Proposal, ...], PointsState]:
         proposals = tuple(map(Proposal, us))
-        return proposals, replace(self, done=self.done + len(proposals))
+        return proposals, replace(self, n_proposed=self.n_proposed + len(proposals))
 
 
-class Unlearning(Policy[PointsState]):
+class NonAdaptivePolicy(Policy[PointsState]):
     """A policy that proposes what it would propose anyway."""
 
     uses_gradient: ClassVar[bool] = False
@@ -56,7 +54,7 @@ class Unlearning(Policy[PointsState]):
 
 
 @dataclass(frozen=True)
-class Random(Unlearning):
+class Random(NonAdaptivePolicy):
     """Independent samples within the budget, by turns at the extremes of the norm balls
     and in their interior.
 
@@ -76,15 +74,15 @@ class Random(Unlearning):
     def propose(
         self, state: PointsState, n: int
     ) -> tuple[tuple[Proposal, ...], PointsState]:
-        numbers = range(state.done, state.done + n)
-        return state.proposing(
+        numbers = range(state.n_proposed, state.n_proposed + n)
+        return state.propose(
             state.domain.sample(seeded(state.seed, k), extreme=k % 2 == 0)[0]
             for k in numbers
         )
 
 
 @dataclass(frozen=True)
-class Sobol(Unlearning):
+class Sobol(NonAdaptivePolicy):
     """A scrambled Sobol sequence over the whole domain (Sobol 1967; scrambled as by
     Owen 1998, Matousek 1998).
 
@@ -114,20 +112,23 @@ class Sobol(Unlearning):
         seed = draw_seed(generator)
         most = max(1, CHUNK // size)
         count = 2 ** max(0, min(steps - 1, most - 1).bit_length())
-        return PointsState(domain, seed, draw(size, seed, 0, count))
+        return PointsState(domain, seed, sample_points(size, seed, 0, count))
 
     def propose(
         self, state: PointsState, n: int
     ) -> tuple[tuple[Proposal, ...], PointsState]:
         count, size = state.points.shape
-        if state.done and state.done % count == 0:
-            state = replace(state, points=draw(size, state.seed, state.done, count))
-        return state.proposing(
-            to_domain(state.domain, x) for x in state.points[state.done % count :][:n]
+        if state.n_proposed and state.n_proposed % count == 0:
+            state = replace(
+                state, points=sample_points(size, state.seed, state.n_proposed, count)
+            )
+        return state.propose(
+            to_domain(state.domain, x)
+            for x in state.points[state.n_proposed % count :][:n]
         )
 
 
-def draw(size: int, seed: int, begin: int, count: int) -> Tensor:
+def sample_points(size: int, seed: int, begin: int, count: int) -> Tensor:
     """Return `count` points of the scrambled sequence of that seed from number `begin`
     on: (count, size) float32. The first call takes a power of two, which is what keeps
     the points balanced.
@@ -146,9 +147,9 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
     """
     u = torch.lerp(domain.lower, domain.upper, x[: domain.dim])
     radii = iter(x[domain.dim :].tolist())
-    for block, part in domain.parts():
+    for block, part in domain.list_block_slices():
         if block.options:
-            u[part] = centre_of_option(x[part], block.options)
+            u[part] = option_center(x[part], block.options)
         elif block.norm == "l2" and block.epsilon is not None:
             direction = torch.special.ndtri(x[part].double().clamp(1e-9, 1.0 - 1e-9))
             length = block.epsilon * next(radii) ** (1.0 / block.size)
@@ -158,7 +159,7 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Grid(Unlearning):
+class Grid(NonAdaptivePolicy):
     """Every combination of evenly spaced values, then nothing more.
 
     A number takes both its ends and what lies evenly between; an angle does not repeat
@@ -192,7 +193,7 @@ class Grid(Unlearning):
         counts = _counts(domain, steps, self.points)
         low = domain.lower.clone()
         high = domain.upper.clone()
-        for block, part in domain.parts():
+        for block, part in domain.list_block_slices():
             # the cube around the ball
             if block.norm == "l2" and block.epsilon is not None:
                 low[part] = low[part].maximum(domain.start[part] - block.epsilon)
@@ -221,8 +222,11 @@ class Grid(Unlearning):
     def propose(
         self, state: PointsState, n: int
     ) -> tuple[tuple[Proposal, ...], PointsState]:
-        return state.proposing(
-            map(state.domain.project, state.points[state.done : state.done + n])
+        return state.propose(
+            map(
+                state.domain.project,
+                state.points[state.n_proposed : state.n_proposed + n],
+            )
         )
 
 

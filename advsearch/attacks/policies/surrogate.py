@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from advsearch.attacks.domain import Domain, centre_of_option, wraps
+from advsearch.attacks.domain import Domain, find_periodic, option_center
 from advsearch.attacks.evaluation import Evaluated, seeded
 
 # more coordinates than this are screened with independent points; Sobol's advantage is
 # long gone
-MOST_SOBOL = 1000
+MAX_SOBOL_DIM = 1000
 # about so many coordinates change in one local move; all, where there are no more
 MOVED = 4
 ANOTHER = 0.3  # share of moved choices that are drawn anew
@@ -27,7 +27,7 @@ FARTHEST = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Coordinates:
+class BoxCoordinates:
     """Which elements of u these are (k,), and what a point x in [0, 1]^k means:
     u[where] = low + width * x. At the ends of `periodic` ones is the same place; a
     discrete choice has `options`, others 0.
@@ -43,11 +43,11 @@ class Coordinates:
     def count(self) -> int:
         return len(self.where)
 
-    def take(self, u: Tensor) -> Tensor:
+    def from_configuration(self, u: Tensor) -> Tensor:
         """Return the points (..., k) at which configurations (..., d) stand."""
         return ((u[..., self.where] - self.low) / self.width).clamp_(0.0, 1.0)
 
-    def put(self, u: Tensor, x: Tensor) -> Tensor:
+    def to_configuration(self, u: Tensor, x: Tensor) -> Tensor:
         """Return a copy of configurations (..., d), moved to points (..., k)."""
         u = u.clone()
         u[..., self.where] = torch.clamp(
@@ -55,25 +55,25 @@ class Coordinates:
         )
         return u
 
-    def tidy(self, x: Tensor) -> Tensor:
+    def normalize(self, x: Tensor) -> Tensor:
         """Return points (n, k) brought back: angles wrap, choices go to the middle of
         their option, the rest clips.
         """
         x = torch.where(self.periodic, torch.remainder(x, 1.0), x).clamp_(0.0, 1.0)
         return torch.where(
-            self.options > 0, centre_of_option(x, self.options.clamp(min=1)), x
+            self.options > 0, option_center(x, self.options.clamp(min=1)), x
         )
 
-    def screen(self, seed: int, n: int) -> Tensor:
+    def sample_screen(self, seed: int, n: int) -> Tensor:
         """Return points (n, k) spread evenly: a scrambled Sobol sequence."""
         if n == 0:
             return torch.empty(0, self.count)
-        if self.count > MOST_SOBOL:
-            return self.tidy(torch.rand(n, self.count, generator=seeded(seed, 0)))
+        if self.count > MAX_SOBOL_DIM:
+            return self.normalize(torch.rand(n, self.count, generator=seeded(seed, 0)))
         engine = torch.quasirandom.SobolEngine(self.count, scramble=True, seed=seed)
-        return self.tidy(engine.draw(n))
+        return self.normalize(engine.draw(n))
 
-    def moves(self, x: Tensor, generator: torch.Generator) -> Tensor:
+    def sample_moves(self, x: Tensor, generator: torch.Generator) -> Tensor:
         """Return points (n, k), each near its own in x: a few coordinates of each
         moved, near or far.
         """
@@ -89,7 +89,9 @@ class Coordinates:
             & (torch.rand(n, k, generator=generator) < ANOTHER)
         )
         x = torch.where(self.options > 0, x, near)
-        return self.tidy(torch.where(anew, torch.rand(n, k, generator=generator), x))
+        return self.normalize(
+            torch.where(anew, torch.rand(n, k, generator=generator), x)
+        )
 
     def embed(self, x: Tensor, lengths: Tensor) -> Tensor:
         """Return points (n, k) as points (n, f) whose ordinary distances are what a
@@ -115,19 +117,21 @@ class Coordinates:
         return torch.cat(parts, dim=1)
 
 
-def box_coordinates(domain: Domain) -> Coordinates:
+def find_box_coordinates(domain: Domain) -> BoxCoordinates:
     """Return the coordinates of a domain that belong to no norm ball; there may be
     none.
     """
     boxes = [
         torch.arange(part.start, part.stop)
-        for block, part in domain.parts()
+        for block, part in domain.list_block_slices()
         if block.norm == "box"
     ]
     where = torch.cat([torch.empty(0, dtype=torch.long), *boxes])
     low = domain.lower[where]
     width = domain.upper[where] - domain.lower[where]
-    return Coordinates(where, low, width, wraps(domain)[where], domain.options[where])
+    return BoxCoordinates(
+        where, low, width, find_periodic(domain)[where], domain.options[where]
+    )
 
 
 LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
@@ -149,7 +153,9 @@ EVIDENCE = 1.0
 REFIT = 5
 # so many of the best points and so many of the latest count, unless more are asked for
 MEMORY = 100
-MOST_OWN = 16  # up to so many coordinates have lengths of their own; more share one
+MAX_SCALED_DIM = (
+    16  # up to so many coordinates have lengths of their own; more share one
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +175,7 @@ class Surrogate:
     values (n,); mean and variance of the signal; log-likelihood.
     """
 
-    space: Coordinates
+    space: BoxCoordinates
     x: Tensor
     scales: Scales
     factor: Tensor
@@ -190,13 +196,13 @@ class Surrogate:
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
+class Observations:
     """What was evaluated, points (n, k) and n objectives, not finite where it could not
     be, and the scales of the process behind it, fitted to the first `fitted`. The best
     and the latest points count, so many of each; for the scales `MEMORY`.
     """
 
-    space: Coordinates
+    space: BoxCoordinates
     points: Tensor
     values: tuple[float, ...] = ()
     scales: Scales | None = None
@@ -204,12 +210,15 @@ class Observed:
     memory: int = MEMORY
 
     @property
-    def finite(self) -> bool:
+    def has_finite(self) -> bool:
         return any(math.isfinite(value) for value in self.values)
 
-    def extended(self, evaluated: Evaluated) -> Observed:
+    def extend(self, evaluated: Evaluated) -> Observations:
         points = torch.cat(
-            [self.points, *(self.space.take(u)[None] for u, _ in evaluated)]
+            [
+                self.points,
+                *(self.space.from_configuration(u)[None] for u, _ in evaluated),
+            ]
         )
         return replace(
             self,
@@ -220,7 +229,7 @@ class Observed:
             ),
         )
 
-    def surrogate(self) -> tuple[Surrogate, Observed]:
+    def fit_surrogate(self) -> tuple[Surrogate, Observations]:
         """Return the process behind what was seen, its scales fitted again if it is
         time; something is finite.
 
@@ -260,7 +269,7 @@ def kernel(a: Tensor, b: Tensor) -> Tensor:
 
 
 def fit(
-    space: Coordinates, x: Tensor, y: Tensor, scales: Scales | None = None
+    space: BoxCoordinates, x: Tensor, y: Tensor, scales: Scales | None = None
 ) -> Surrogate:
     """Return the process given values (n,) at points (n, k), mean and variance at their
     best; the scales too are fitted unless they are given.
@@ -282,7 +291,7 @@ def fit(
     return Surrogate(space, x, scales, factor, weights, mean, variance, likelihood)
 
 
-def _best_scales(space: Coordinates, x: Tensor, y: Tensor) -> Scales:
+def _best_scales(space: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
     """The most likely common length and noise, then length by length what the evidence
     asks for.
     """
@@ -302,7 +311,7 @@ def _best_scales(space: Coordinates, x: Tensor, y: Tensor) -> Scales:
             for noise in NOISES
         ]
     )
-    for j in range(k if 1 < k <= MOST_OWN else 0):
+    for j in range(k if 1 < k <= MAX_SCALED_DIM else 0):
         changed = []
         for stretch in STRETCHES:
             lengths = best.scales.lengths.clone()

@@ -27,12 +27,12 @@ class Sheets(Exporter):
         from advsearch.extend import exports  # takes seconds
 
         known_size = (
-            exports.real_size(run) if options["size"] is None else options["size"]
+            exports.get_real_size(run) if options["size"] is None else options["size"]
         )
         longest = USUAL_SIZE if known_size is None else known_size
-        pieces = exports.printable(run, longest)
+        pieces = exports.make_printable_pieces(run, longest)
         profile = None if options["icc"] is None else Path(options["icc"])
-        title = f"{Path(run).name}, object of {exports.rounded(longest)} mm"
+        title = f"{Path(run).name}, object of {exports.format_rounded(longest)} mm"
         paper = (options["paper"] or "a4").lower()
         most = exports.MOST_SHEETS if options["sheets"] is None else options["sheets"]
         with writing.placed_by("out"), writing.replacing(out) as part:
@@ -43,7 +43,7 @@ class Sheets(Exporter):
                 paper=paper,
                 profile=profile,
                 most=most,
-                last=exports.chart_page,
+                last=exports.draw_chart_page,
             )
         sizes = [
             {"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]}
@@ -57,6 +57,6 @@ class Sheets(Exporter):
         if known_size is None:
             text += (
                 "\nThe real object's longest side is taken for "
-                f"{exports.rounded(longest)} mm; --size says otherwise."
+                f"{exports.format_rounded(longest)} mm; --size says otherwise."
             )
         return Exported({"pages": pages, "size_mm": longest, "pieces": sizes}, text)

@@ -102,9 +102,9 @@ class ThreeDB(Exporter):
         from advsearch.extend import exports  # takes seconds
 
         run_path = directory.find_run(run)
-        kept = exports.thumbnails.kept_pictures(run_path)
+        kept = exports.thumbnails.find_thumbnails(run_path)
         with Store(run_path / Store.FILE, read_only=True) as store:
-            picture = kept.png_of if kept else lambda _: None
+            picture = kept.read_png if kept else lambda _: None
             count = write_threedb(
                 lambda: store.rows(options["kind"] or "sweep"), out, picture
             )

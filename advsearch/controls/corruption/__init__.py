@@ -27,7 +27,7 @@ from advsearch.extend import Choice, Control, Parameter, Value, Values, images
 BRIGHTNESS = ((0.1,), (0.2,), (0.3,), (0.4,), (0.5,))
 # factor on the distance from the mean
 CONTRAST = ((0.4,), (0.3,), (0.2,), (0.1,), (0.05,))
-SATURATE = ((0.3, 0.0), (0.1, 0.0), (2.0, 0.0), (5.0, 0.1), (20.0, 0.2))
+SATURATION = ((0.3, 0.0), (0.1, 0.0), (2.0, 0.0), (5.0, 0.1), (20.0, 0.2))
 """Factor on the saturation, and what is added to it."""
 PIXELATE = (0.6, 0.5, 0.4, 0.3, 0.25)  # pixels left along a side, as a share
 JPEG = (25, 18, 15, 10, 7)  # quality
@@ -37,7 +37,7 @@ _GREY = 1.0 / 512.0
 
 def brightness(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Raise the value, keep hue and saturation."""
-    (increase,) = filters.at_level(BRIGHTNESS, level)
+    (increase,) = filters.interpolate_table(BRIGHTNESS, level)
     value = image.amax(dim=-1, keepdim=True)
     return image + ((value + increase).clamp(max=1.0) - value) * (image + _GREY) / (
         value + _GREY
@@ -46,41 +46,43 @@ def brightness(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 def contrast(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Pull every value towards its channel's mean."""
-    (factor,) = filters.at_level(CONTRAST, level)
+    (factor,) = filters.interpolate_table(CONTRAST, level)
     mean = image.mean(dim=(0, 1))
     return mean + factor * (image - mean)
 
 
 def saturate(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Scale the saturation, keep hue and value; grey stays grey."""
-    factor, increase = filters.at_level(SATURATE, level)
+    factor, increase = filters.interpolate_table(SATURATION, level)
     value = image.amax(dim=-1, keepdim=True)
     saturation = (value - image.amin(dim=-1, keepdim=True)) / (value + _GREY)
     new_saturation = (factor * saturation + increase).clamp(max=1.0)
     return value - (value - image) * new_saturation / (saturation + _GREY)
 
 
-def pixelate(image: Tensor, whole: int) -> Tensor:
+def pixelate(image: Tensor, severity: int) -> Tensor:
     """Average the picture over square cells; linear in the picture.
 
     A cell has 1.7 to 4 pixels of a picture of the reference size, more in a larger one,
     and as many in a smaller one.
     """
     height, width = image.shape[:2]
-    fraction = PIXELATE[whole - 1] / max(1.0, min(height, width) / filters.REFERENCE)
+    fraction = PIXELATE[severity - 1] / max(
+        1.0, min(height, width) / filters.REFERENCE_SIDE
+    )
     cells = (max(1, int(height * fraction)), max(1, int(width * fraction)))
-    averaged = F.interpolate(images.planes(image), cells, mode="area")
-    return images.picture(
+    averaged = F.interpolate(images.to_planes(image), cells, mode="area")
+    return images.to_image(
         F.interpolate(averaged, (height, width), mode="nearest-exact")
     )
 
 
-def jpeg(image: Tensor, whole: int) -> Tensor:
-    """Save as a JPEG file of the severity's quality and read it again; see `coded`."""
-    return images.coded(image, JPEG[whole - 1])
+def jpeg(image: Tensor, severity: int) -> Tensor:
+    """Save as a JPEG file of the severity's quality and read it again; see `compress_jpeg`."""
+    return images.compress_jpeg(image, JPEG[severity - 1])
 
 
-SMOOTH: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
+CONTINUOUS_CORRUPTIONS: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
     corruption.__name__: corruption
     for corruption in (
         filters.gaussian_noise,
@@ -103,18 +105,22 @@ SMOOTH: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
 """Corruptions of every severity in [1, 5], mixed in below: of the picture, the severity
 and the seed.
 """
-FROM_NOTHING: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
+CONTINUOUS_FROM_ZERO: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
     "elastic": filters.elastic
 }
 """Corruptions of every severity in [0, 5]: a mix of a warped and an unwarped picture
 would show the object twice.
 """
-STEPPED: Mapping[str, Callable[[Tensor, int], Tensor]] = {
+STEPPED_CORRUPTIONS: Mapping[str, Callable[[Tensor, int], Tensor]] = {
     "pixelate": pixelate,
     "jpeg": jpeg,
 }
 """Corruptions of whole severities only: of the picture and the severity."""
-NAMES = (*SMOOTH, *FROM_NOTHING, *STEPPED)
+CORRUPTION_NAMES = (
+    *CONTINUOUS_CORRUPTIONS,
+    *CONTINUOUS_FROM_ZERO,
+    *STEPPED_CORRUPTIONS,
+)
 
 
 class CorruptionControl(Control):
@@ -126,18 +132,20 @@ class CorruptionControl(Control):
     amount = "severity"
     parameters = (
         replace(
-            Parameter.named("which", NAMES, NAMES[0], "Which corruption."),
-            search=(0, len(NAMES) - 1),
+            Parameter.named(
+                "which", CORRUPTION_NAMES, CORRUPTION_NAMES[0], "Which corruption."
+            ),
+            search=(0, len(CORRUPTION_NAMES) - 1),
         ),
         Parameter.number(
             ("image",),
             "severity",
             "1",
             0.0,
-            float(filters.LEVELS),
+            float(filters.MAX_SEVERITY),
             0.0,
             "How strong it is: 0 is none, 1 to 5 are the published severities.",
-            (0.0, float(filters.LEVELS)),
+            (0.0, float(filters.MAX_SEVERITY)),
         ),
     )
     choices = (
@@ -153,18 +161,18 @@ class CorruptionControl(Control):
         super().__init__(name, **settings)
         # a name without a severity does nothing, and a severity needs a name: what is
         # not given is searched
-        self.asked = False
+        self.has_requested_search = False
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
-        stepped = parameter.name == "severity" and {*self.allowed("which", *NAMES)} <= {
-            *STEPPED
-        }
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
+        stepped = parameter.name == "severity" and {
+            *self.list_allowed_values("which", *CORRUPTION_NAMES)
+        } <= {*STEPPED_CORRUPTIONS}
         return replace(parameter, estimators=()) if stepped else parameter
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
-        return corrupted(
+        return apply_corruption(
             image,
-            NAMES[int(values["which"])],
+            CORRUPTION_NAMES[int(values["which"])],
             values["severity"],
             int(self.chosen["seed"]),
         )
@@ -175,19 +183,21 @@ class CorruptionControl(Control):
         """Return the severity that is applied: a whole one for stepped corruptions."""
         severity = values["severity"]
         applied = (
-            nearest(severity)
-            if NAMES[int(values["which"])] in STEPPED
+            round_severity(severity)
+            if CORRUPTION_NAMES[int(values["which"])] in STEPPED_CORRUPTIONS
             else float(severity)
         )
         return {"applied": Value(value=float(applied), unit="1")}
 
 
-def corrupted(image: Tensor, which: str, severity: Tensor, seed: int = 0) -> Tensor:
+def apply_corruption(
+    image: Tensor, name: str, severity: Tensor, seed: int = 0
+) -> Tensor:
     """Corrupt a picture.
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].
-        which: one of `NAMES`.
+        name: one of `CORRUPTION_NAMES`.
         severity: () in [0, 5]; 0 returns the picture.
         seed: chooses the noise.
 
@@ -195,25 +205,27 @@ def corrupted(image: Tensor, which: str, severity: Tensor, seed: int = 0) -> Ten
         (H, W, 3) sRGB in [0, 1]; differentiable in the picture and the severity, as
         `docs/controls/corruption.md` says.
     """
-    if which in STEPPED:
-        apply_at = STEPPED[which]
-        applied_severity = nearest(severity)
+    if name in STEPPED_CORRUPTIONS:
+        apply_at = STEPPED_CORRUPTIONS[name]
+        applied_severity = round_severity(severity)
         result = apply_at(image, applied_severity) if applied_severity else image
         # by the straight lines between the steps: a staircase has no slope
         if severity.requires_grad:
-            below = min(int(severity.detach()), filters.LEVELS - 1)
+            below = min(int(severity.detach()), filters.MAX_SEVERITY - 1)
             low = apply_at(image, below).detach() if below else image.detach()
             high = apply_at(image, below + 1).detach()
             result = result + (severity - severity.detach()) * (high - low)
         return result.clamp(0.0, 1.0)
-    if which in FROM_NOTHING:
-        return FROM_NOTHING[which](image, severity, seed).clamp(0.0, 1.0)
+    if name in CONTINUOUS_FROM_ZERO:
+        return CONTINUOUS_FROM_ZERO[name](image, severity, seed).clamp(0.0, 1.0)
     if float(severity.detach()) >= 1.0:
-        return SMOOTH[which](image, severity, seed).clamp(0.0, 1.0)
-    mildest = SMOOTH[which](image, torch.ones_like(severity), seed).clamp(0.0, 1.0)
+        return CONTINUOUS_CORRUPTIONS[name](image, severity, seed).clamp(0.0, 1.0)
+    mildest = CONTINUOUS_CORRUPTIONS[name](
+        image, torch.ones_like(severity), seed
+    ).clamp(0.0, 1.0)
     return (image + severity * (mildest - image)).clamp(0.0, 1.0)
 
 
-def nearest(severity: Tensor) -> int:
+def round_severity(severity: Tensor) -> int:
     """Return the whole severity nearest to one, halves upwards."""
     return int(float(severity.detach()) + 0.5)

@@ -3,7 +3,7 @@ severity, blurs, warps.
 
 Hendrycks & Dietterich 2019, arXiv 1903.12261, appendix A; their frost is photographs,
 and here it is grown from noise. Pictures are (H, W, 3) float32 display-referred sRGB in
-[0, 1]. Lengths in the tables are pixels of a picture whose smaller side has `REFERENCE`
+[0, 1]. Lengths in the tables are pixels of a picture whose smaller side has `REFERENCE_SIDE`
 pixels. Noise is one fixed draw, chosen by the seed: the same at every severity.
 """
 
@@ -24,55 +24,59 @@ from torch import Tensor
 from advsearch.extend import images, seeds
 
 # smaller side in pixels of the pictures that the published tables were made for
-REFERENCE = 224
-LEVELS = 5  # severities run from 1 to this
+REFERENCE_SIDE = 224
+MAX_SEVERITY = 5  # severities run from 1 to this
 
 
-def scale(image: Tensor) -> float:
+def compute_pixel_scale(image: Tensor) -> float:
     """Return pixels of this (H, W, 3) picture for a pixel of the reference size."""
-    return min(image.shape[0], image.shape[1]) / REFERENCE
+    return min(image.shape[0], image.shape[1]) / REFERENCE_SIDE
 
 
-def reference_size(height: int, width: int) -> tuple[int, int]:
+def compute_reference_size(height: int, width: int) -> tuple[int, int]:
     """Return the rows and columns of a reference image of the same shape.
 
-    Its smaller side has `REFERENCE` pixels.
+    Its smaller side has `REFERENCE_SIDE` pixels.
     """
     side = min(height, width)
-    return round(height * REFERENCE / side), round(width * REFERENCE / side)
+    return round(height * REFERENCE_SIDE / side), round(width * REFERENCE_SIDE / side)
 
 
-def generator(seed: int, name: str) -> torch.Generator:
+def make_generator(seed: int, name: str) -> torch.Generator:
     """Return a source of random numbers of its own for each corruption."""
     return torch.Generator().manual_seed(seeds.stream(seed, f"corruption {name}"))
 
 
-def at_level(table: Sequence[Sequence[float]], level: Tensor) -> tuple[Tensor, ...]:
+def interpolate_table(
+    table: Sequence[Sequence[float]], level: Tensor
+) -> tuple[Tensor, ...]:
     """Interpolate the five rows of a table linearly at a severity () in [1, 5].
 
     Returns one tensor () a column; differentiable.
     """
     rows = torch.tensor(table, dtype=torch.float32, device=level.device)
-    return between(level, lambda severity: rows[severity - 1]).unbind()
+    return interpolate_severity(level, lambda severity: rows[severity - 1]).unbind()
 
 
-def between(level: Tensor, make: Callable[[int], Tensor]) -> Tensor:
-    """Mix what `make` returns for the whole severities below and above a severity.
+def interpolate_severity(
+    level: Tensor, make_at_severity: Callable[[int], Tensor]
+) -> Tensor:
+    """Mix what `make_at_severity` returns for the whole severities below and above a severity.
 
     Args:
         level: () in [1, 5]; the result is differentiable in it, and on its device.
-        make: returns a tensor for a whole severity.
+        make_at_severity: returns a tensor for a whole severity.
     """
-    below = min(int(level.detach()), LEVELS - 1)
+    below = min(int(level.detach()), MAX_SEVERITY - 1)
     fraction = level - below
     if float(fraction.detach()) == 0.0 and not fraction.requires_grad:
-        return make(below).to(level.device)
-    lower = make(below).to(level.device)
-    upper = make(below + 1).to(level.device)
+        return make_at_severity(below).to(level.device)
+    lower = make_at_severity(below).to(level.device)
+    upper = make_at_severity(below + 1).to(level.device)
     return lower + fraction * (upper - lower)
 
 
-def blurred(image: Tensor, sigma: Tensor) -> Tensor:
+def blur_gaussian(image: Tensor, sigma: Tensor) -> Tensor:
     """Blur an (H, W, C) picture with a Gaussian of () standard deviation in pixels.
 
     Edges are continued.
@@ -82,18 +86,18 @@ def blurred(image: Tensor, sigma: Tensor) -> Tensor:
     weights = torch.exp(-0.5 * (offsets / sigma) ** 2)
     weights = weights / weights.sum()
     channels = image.shape[2]
-    padded = F.pad(images.planes(image), (reach,) * 4, mode="replicate")
+    padded = F.pad(images.to_planes(image), (reach,) * 4, mode="replicate")
     rows = F.conv2d(
         padded, weights.view(1, 1, -1, 1).expand(channels, 1, -1, 1), groups=channels
     )
-    return images.picture(
+    return images.to_image(
         F.conv2d(
             rows, weights.view(1, 1, 1, -1).expand(channels, 1, 1, -1), groups=channels
         )
     )
 
 
-def streaked(
+def blur_along_line(
     image: Tensor, radius: Tensor, sigma: Tensor, angle: float, step: float
 ) -> Tensor:
     """Blur an image along a line: a one-sided Gaussian, cut off at twice the radius.
@@ -111,13 +115,13 @@ def streaked(
     weights = torch.exp(-0.5 * (distance / sigma) ** 2) * cut_off
     weights = weights / weights.sum()
     height, width = image.shape[:2]
-    padded = F.pad(images.planes(image), (count,) * 4, mode="replicate")
+    padded = F.pad(images.to_planes(image), (count,) * 4, mode="replicate")
     total = torch.zeros_like(image)
     for index, weight in enumerate(weights):
         top = count + round(index * math.sin(angle))
         left = count + round(index * math.cos(angle))
         shifted = padded[:, :, top : top + height, left : left + width]
-        total = total + weight * images.picture(shifted)
+        total = total + weight * images.to_image(shifted)
     return total
 
 
@@ -131,20 +135,20 @@ _DARK = 1e-3  # keeps the slope of a square root finite in black
 
 
 def _noise(image: Tensor, seed: int, name: str, *, normal: bool = True) -> Tensor:
-    return images.drawn(
+    return images.draw_noise(
         image.shape[0], image.shape[1], seed, f"corruption {name}", normal=normal
     ).to(image.device)
 
 
 def gaussian_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Add normal noise, as of a sensor in the dark."""
-    (sigma,) = at_level(GAUSSIAN, level)
+    (sigma,) = interpolate_table(GAUSSIAN, level)
     return image + sigma * _noise(image, seed, "gaussian noise")
 
 
 def speckle_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Add normal noise in proportion to the value."""
-    (sigma,) = at_level(SPECKLE, level)
+    (sigma,) = interpolate_table(SPECKLE, level)
     return image + image * sigma * _noise(image, seed, "speckle noise")
 
 
@@ -155,26 +159,26 @@ def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     in the distribution, a number of standard deviations from the mean, when the mean or
     the spread changes a little.
     """
-    (photons,) = at_level(SHOT, level)
+    (photons,) = interpolate_table(SHOT, level)
     quantile = _noise(image, seed, "shot noise", normal=False)
     with torch.no_grad():
-        counted = poisson(image * photons, quantile) / photons
+        counted = sample_poisson(image * photons, quantile) / photons
         deviations = (counted - image) / torch.sqrt(image / photons + _DARK)
     return image + deviations * torch.sqrt(image / photons + _DARK)
 
 
-def poisson(mean: Tensor, share: Tensor) -> Tensor:
+def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
     """Return Poisson counts by inverting the distribution function; no derivative.
 
     Args:
         mean: of each count, 0 to about 80.
-        share: quantile of each count in [0, 1), of the same shape.
+        quantile: quantile of each count in [0, 1), of the same shape.
     """
     probability = torch.exp(-mean.double())
     total = probability.clone()
     count = torch.zeros_like(probability)
     for candidate in range(1, 400):
-        is_above = share > total
+        is_above = quantile > total
         if not bool(is_above.any()):
             break
         count += is_above
@@ -189,7 +193,7 @@ def impulse_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     A value is lost at once, which has no derivative by the fraction of lost values; the
     derivative is that of the average over all draws of which ones are lost.
     """
-    (lost_fraction,) = at_level(IMPULSE, level)
+    (lost_fraction,) = interpolate_table(IMPULSE, level)
     draw = _noise(image, seed, "impulse noise", normal=False)
     extreme = (_noise(image, seed, "impulse value", normal=False) < 0.5).float()
     noisy = torch.where(draw < lost_fraction.detach(), extreme, image)
@@ -222,42 +226,46 @@ reference pixels.
 
 def gaussian_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Blur with a Gaussian."""
-    (sigma,) = at_level(GAUSSIAN_BLUR, level)
-    return blurred(image, sigma * scale(image))
+    (sigma,) = interpolate_table(GAUSSIAN_BLUR, level)
+    return blur_gaussian(image, sigma * compute_pixel_scale(image))
 
 
 def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Blur with a disc, the picture of a point that a lens has out of focus."""
-    (radius,) = at_level(DEFOCUS, level)
-    radius = radius * scale(image)
+    (radius,) = interpolate_table(DEFOCUS, level)
+    radius = radius * compute_pixel_scale(image)
     reach = math.ceil(float(radius.detach()) + 0.5)
     offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
     distance = torch.sqrt(offsets[:, None] ** 2 + offsets[None, :] ** 2)
     disc = (radius + 0.5 - distance).clamp(0.0, 1.0)
     height, width = image.shape[:2]
-    padded = F.pad(images.planes(image), (reach,) * 4, mode="replicate")
+    padded = F.pad(images.to_planes(image), (reach,) * 4, mode="replicate")
     size = (padded.shape[2] + 2 * reach, padded.shape[3] + 2 * reach)
     product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(
         disc / disc.sum(), s=size
     )
     convolved = torch.fft.irfft2(product, s=size)
-    return images.picture(
+    return images.to_image(
         convolved[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width]
     )
 
 
 def motion_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Blur along a line within 45 degrees of the horizontal, like a moving camera."""
-    radius, sigma = at_level(MOTION, level)
-    turn = float(torch.rand((), generator=generator(seed, "motion blur")))
-    return streaked(
-        image, radius, sigma, math.radians(90.0 * turn - 45.0), scale(image)
+    radius, sigma = interpolate_table(MOTION, level)
+    turn = float(torch.rand((), generator=make_generator(seed, "motion blur")))
+    return blur_along_line(
+        image,
+        radius,
+        sigma,
+        math.radians(90.0 * turn - 45.0),
+        compute_pixel_scale(image),
     )
 
 
 def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Average the image with magnified ones, like a camera that moves ahead."""
-    (largest,) = at_level(ZOOM, level)
+    (largest,) = interpolate_table(ZOOM, level)
     zooms = 1.0 + (largest - 1.0) * torch.linspace(
         0.0, 1.0, ZOOM_STEPS, device=level.device
     )
@@ -267,19 +275,22 @@ def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     )
     height, width = image.shape[:2]
     grid = F.affine_grid(theta, [ZOOM_STEPS, 3, height, width], align_corners=False)
-    copies = images.planes(image).expand(ZOOM_STEPS, -1, -1, -1)
+    copies = images.to_planes(image).expand(ZOOM_STEPS, -1, -1, -1)
     zoomed = F.grid_sample(copies, grid, padding_mode="border", align_corners=False)
     return (image + zoomed.sum(dim=0).permute(1, 2, 0)) / (ZOOM_STEPS + 1)
 
 
 def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Blur, show at each pixel what a neighbor shows, and blur again."""
-    sigma = at_level(GLASS, level)[0] * scale(image)
-    shift = between(
+    sigma = interpolate_table(GLASS, level)[0] * compute_pixel_scale(image)
+    shift = interpolate_severity(
         level,
         lambda severity: _glass_shift(image.shape[0], image.shape[1], seed, severity),
     )
-    return blurred(images.warped(blurred(image, sigma), shift * scale(image)), sigma)
+    return blur_gaussian(
+        images.warp(blur_gaussian(image, sigma), shift * compute_pixel_scale(image)),
+        sigma,
+    )
 
 
 @lru_cache(maxsize=8)
@@ -298,9 +309,9 @@ def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
     Returns:
         (H, W, 2) to the right and down, in pixels of the reference image.
     """
-    rows, columns = reference_size(height, width)
+    rows, columns = compute_reference_size(height, width)
     _, reach, n_passes = (int(value) for value in GLASS[severity - 1])
-    source = generator(seed, "glass blur")
+    source = make_generator(seed, "glass blur")
     origins = list(range(rows * columns))
     for _ in range(n_passes):
         jumps = torch.randint(-reach, reach, (rows, columns, 2), generator=source)
@@ -311,7 +322,7 @@ def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
     right = origin % columns - pixel % columns
     down = origin // columns - pixel // columns
     shift = torch.stack([right, down]).view(1, 2, rows, columns).float()
-    return images.picture(F.interpolate(shift, (height, width), mode="nearest-exact"))
+    return images.to_image(F.interpolate(shift, (height, width), mode="nearest-exact"))
 
 
 def _swap_in_neighbors(
@@ -329,11 +340,11 @@ def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     if float(severity.detach()) < 1.0:
         shift = severity * _elastic_shift(height, width, seed, 1).to(severity.device)
     else:
-        shift = between(
+        shift = interpolate_severity(
             severity,
             lambda whole_severity: _elastic_shift(height, width, seed, whole_severity),
         )
-    return images.warped(image, scale(image) * shift)
+    return images.warp(image, compute_pixel_scale(image) * shift)
 
 
 @lru_cache(maxsize=8)
@@ -349,9 +360,9 @@ def _elastic_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
     Returns:
         (H, W, 2) to the right and down, in pixels of the reference image.
     """
-    rows, columns = reference_size(height, width)
+    rows, columns = compute_reference_size(height, width)
     wrinkle_height, wrinkle_width, corner_shift = ELASTIC[severity - 1]
-    source = generator(seed, "elastic")
+    source = make_generator(seed, "elastic")
     corners = (torch.rand(3, 2, generator=source) * 2.0 - 1.0) * corner_shift
     noise = torch.rand(rows, columns, 2, generator=source) * 2.0 - 1.0
     waves = ndimage.gaussian_filter(
@@ -370,7 +381,7 @@ def _shear(rows: int, columns: int, corners: Tensor) -> Tensor:
 
     They are corners of the middle third of the image.
     """
-    third = REFERENCE // 3
+    third = REFERENCE_SIDE // 3
     by_row = (corners[0] - corners[1]) / (2 * third)
     by_column = (corners[0] - corners[2]) / (2 * third) - by_row
     row = torch.arange(rows)[:, None, None] - (rows - 1) / 2.0
@@ -385,7 +396,7 @@ FOG_DECAY = (2.0, 2.0, 1.7, 1.5, 1.4)
 FROST = ((1.0, 0.4), (0.8, 0.6), (0.7, 0.7), (0.65, 0.7), (0.6, 0.75))
 # square half-pixels of the reference picture for each feather of ice
 FEATHER_AREA = 260
-ICE = (0.86, 0.95, 1.0)  # colour of the ice, sRGB
+ICE_COLOR = (0.86, 0.95, 1.0)  # colour of the ice, sRGB
 SNOW = (
     (0.1, 0.3, 3.0, 0.5, 10.0, 4.0),
     (0.2, 0.3, 2.0, 0.5, 12.0, 4.0),
@@ -397,15 +408,15 @@ SNOW = (
 and spread of its streak.
 """
 # weight of the picture; the rest is a paler one
-SNOW_KEEP = ((0.8,), (0.7,), (0.7,), (0.65,), (0.55,))
-LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue in a grey
+SNOW_IMAGE_WEIGHT = ((0.8,), (0.7,), (0.7,), (0.65,), (0.55,))
+LUMA_WEIGHTS = (0.299, 0.587, 0.114)  # weights of red, green and blue in a grey
 
 
 def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Add drifts of white, and scale the brightest value back to what it was."""
     height, width = image.shape[:2]
-    (density,) = at_level(FOG, level)
-    drift = between(
+    (density,) = interpolate_table(FOG, level)
+    drift = interpolate_severity(
         level, lambda severity: _drift(height, width, seed, FOG_DECAY[severity - 1])
     )
     brightest = image.max()
@@ -417,9 +428,9 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
 @lru_cache(maxsize=8)
 def _drift(height: int, width: int, seed: int, decay: float) -> Tensor:
     """Make fog (H, W, 1) in [0, 1]."""
-    rows, columns = reference_size(height, width)
+    rows, columns = compute_reference_size(height, width)
     return images.resized(
-        fractal(max(rows, columns), decay, generator(seed, "fog"))[
+        make_fractal_noise(max(rows, columns), decay, make_generator(seed, "fog"))[
             :rows, :columns, None
         ],
         height,
@@ -427,7 +438,7 @@ def _drift(height: int, width: int, seed: int, decay: float) -> Tensor:
     )
 
 
-def fractal(side: int, decay: float, source: torch.Generator) -> Tensor:
+def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tensor:
     """Make fractal noise in [0, 1] by midpoint displacement on a torus.
 
     It is at least side x side.
@@ -457,7 +468,7 @@ def fractal(side: int, decay: float, source: torch.Generator) -> Tensor:
 
 def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Lay ice crystals over the picture."""
-    keep, ice = at_level(FROST, level)
+    keep, ice = interpolate_table(FROST, level)
     return keep * image + ice * _crystals(image.shape[0], image.shape[1], seed).to(
         image.device
     )
@@ -466,12 +477,14 @@ def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
 @lru_cache(maxsize=4)
 def _crystals(height: int, width: int, seed: int) -> Tensor:
     """Make ice (H, W, 3) in [0, 1]: feathers of crystals over an uneven film."""
-    rows, columns = reference_size(height, width)
-    source = generator(seed, "frost")
-    film = fractal(max(rows, columns), 1.4, source)[:rows, :columns, None]
+    rows, columns = compute_reference_size(height, width)
+    source = make_generator(seed, "frost")
+    film = make_fractal_noise(max(rows, columns), 1.4, source)[:rows, :columns, None]
     feathers = images.resized(_feathers(2 * rows, 2 * columns, source), rows, columns)
     ice = 0.2 + 0.3 * film + (0.45 + 0.75 * film) * feathers
-    return images.resized((ice * torch.tensor(ICE)).clamp(0.0, 1.0), height, width)
+    return images.resized(
+        (ice * torch.tensor(ICE_COLOR)).clamp(0.0, 1.0), height, width
+    )
 
 
 def _feathers(height: int, width: int, source: torch.Generator) -> Tensor:
@@ -509,12 +522,12 @@ def _line(pen: ImageDraw.ImageDraw, begin: complex, end: complex, shine: float) 
 
 def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Pale the picture and let streaks of snow fall before it."""
-    (keep,) = at_level(SNOW_KEEP, level)
-    layer = between(
+    (keep,) = interpolate_table(SNOW_IMAGE_WEIGHT, level)
+    layer = interpolate_severity(
         level,
         lambda severity: _snowfall(image.shape[0], image.shape[1], seed, severity),
     ).to(image.device)
-    grey = (image * image.new_tensor(LUMA)).sum(dim=-1, keepdim=True)
+    grey = (image * image.new_tensor(LUMA_WEIGHTS)).sum(dim=-1, keepdim=True)
     pale = torch.maximum(image, 1.5 * grey + 0.5)
     return keep * image + (1.0 - keep) * pale + layer + layer.rot90(2)
 
@@ -522,9 +535,9 @@ def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
 @lru_cache(maxsize=8)
 def _snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
     """Make falling snow (H, W, 1) in [0, 1] at a whole severity."""
-    rows, columns = reference_size(height, width)
+    rows, columns = compute_reference_size(height, width)
     mean, spread, flake_size, threshold, radius, sigma = SNOW[severity - 1]
-    source = generator(seed, "snow")
+    source = make_generator(seed, "snow")
     angle = math.radians(-135.0 + 90.0 * float(torch.rand((), generator=source)))
     noise = mean + spread * torch.randn(
         math.ceil(rows / flake_size),
@@ -534,5 +547,7 @@ def _snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
     )
     flakes = images.resized(noise, rows, columns)
     flakes = torch.where(flakes < threshold, torch.zeros_like(flakes), flakes)
-    streaks = streaked(flakes, torch.tensor(radius), torch.tensor(sigma), angle, 1.0)
+    streaks = blur_along_line(
+        flakes, torch.tensor(radius), torch.tensor(sigma), angle, 1.0
+    )
     return images.resized(streaks.clamp(0.0, 1.0), height, width)

@@ -39,29 +39,29 @@ from advsearch.extend import (
 
 _moving = partial(Parameter.moving, Parameter.ORBIT)
 
-MADE = ("card", "sphere")
+PRIMITIVES = ("card", "sphere")
 BUNDLED = ("book", "bottle", "vase", "chair", "banana", "hammer")
-OPTIONS = (*MADE, *BUNDLED)
-EASE = 0.02
+OPTIONS = (*PRIMITIVES, *BUNDLED)
+EASE_IN_COVERAGE = 0.02
 """Below this coverage the occluder slides in from outside the frame, so that the
 picture changes without a jump.
 """
 # smallest distance in object sizes between the camera and the occluder
-CLEARANCE = 0.05
+MIN_CAMERA_DISTANCE = 0.05
 
 
 @cache
-def loaded(spec: str) -> assets.ObjectAsset:
+def load_occluder(name: str) -> assets.ObjectAsset:
     """Return an object, its largest extent 1, centered on the origin.
 
     Args:
-        spec: name of a bundled object, or the path of a mesh file.
+        name: name of a bundled object, or the path of a mesh file.
 
     Raises:
         InputError: there is no such object, or the file cannot be used.
     """
-    asset = SceneDescription.load_object(spec)
-    mesh = assets.normalised(asset.mesh)
+    asset = SceneDescription.load_object(name)
+    mesh = assets.normalise_mesh(asset.mesh)
     middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0
     return replace(
         asset, mesh=replace(mesh, vertices=(mesh.vertices - middle).astype(np.float32))
@@ -69,17 +69,17 @@ def loaded(spec: str) -> assets.ObjectAsset:
 
 
 def _load_asset(option: str) -> assets.ObjectAsset:
-    return made(option) if option in MADE else loaded(option)
+    return make_primitive(option) if option in PRIMITIVES else load_occluder(option)
 
 
 @cache
-def made(name: str) -> assets.ObjectAsset:
+def make_primitive(name: str) -> assets.ObjectAsset:
     """Return the "card" or the "sphere", one object size large around the origin."""
     if name == "card":
         return _make_card()
     grey = np.full((4, 4, 3), 0.5, dtype=np.float32)
     return assets.ObjectAsset(
-        name, parts.sphere(24, 48), grey, assets.Material(roughness=0.6)
+        name, parts.make_sphere(24, 48), grey, assets.Material(roughness=0.6)
     )
 
 
@@ -108,12 +108,12 @@ class Placement:
 
     # (3, 3) rows: right, up and forward of a camera that looks at the middle of what is
     # seen
-    axes: assets.Doubles
+    axes: assets.Float64Array
     angle: float  # from that middle to the occluder, radians
     size: float  # made smaller where it would not fit
     distance: float  # from the camera, changed where it would not fit
     hidden: float  # share of the object's picture area
-    away: bool  # it is put away, out of sight
+    is_out_of_sight: bool  # it is put away, out of sight
 
 
 class OcclusionControl(Control):
@@ -124,7 +124,7 @@ class OcclusionControl(Control):
     kind = "occlusion"
     amount = "coverage"
     # none is changed; but it comes after whatever moves the camera or the object
-    refines = frozenset(geometry.SURROUNDINGS)
+    refines = frozenset(geometry.OCCLUDER_INPUTS)
     parameters = (
         Parameter.named(
             "which",
@@ -204,16 +204,16 @@ class OcclusionControl(Control):
                 f"{self.name}.object: expected the name of a bundled object or a path "
                 f"to a mesh file, got {occluder!r}"
             )
-        if "which" in self._given:
+        if "which" in self._settings:
             raise InputError(
                 f"{self.name}: object and which both say what the "
                 "occluder is; leave one of them out"
             )
-        self._given["object"] = self.chosen["object"] = str(occluder)
+        self._settings["object"] = self.chosen["object"] = str(occluder)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Add every occluder that can be chosen, out of sight."""
-        hidden_pose = geometry.put_away(
+        hidden_pose = geometry.make_hidden_pose(
             torch.from_numpy(geometry.camera_to_world(scene))
         ).numpy()
         for option in self._list_options():
@@ -233,13 +233,13 @@ class OcclusionControl(Control):
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the poses of all occluders; those that are not used are out of sight."""
-        camera = geometry.camera_in(self.scene, so_far).to(values["turn"])
+        camera = geometry.get_camera_pose(self.scene, so_far).to(values["turn"])
         inputs = {
-            f"{self._part_name(option)}.to_world": geometry.put_away(camera)
+            f"{self._part_name(option)}.to_world": geometry.make_hidden_pose(camera)
             for option in self._list_options()
         }
-        placed = self.placement(values, so_far)
-        if not placed.away:
+        placed = self.find_placement(values, so_far)
+        if not placed.is_out_of_sight:
             part = self._part_name(self._select_option(values))
             inputs[f"{part}.to_world"] = _compute_pose(camera, placed, values)
         return inputs
@@ -248,9 +248,9 @@ class OcclusionControl(Control):
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return how much is hidden, and the true size and distance of the occluder."""
-        placed = self.placement(values, so_far)
+        placed = self.find_placement(values, so_far)
         measurements = {"hidden": Value(value=float(placed.hidden), unit="1")}
-        if not placed.away:
+        if not placed.is_out_of_sight:
             lengths = {"true_size": placed.size, "true_distance": placed.distance}
             for name, length in lengths.items():
                 measurements[name] = Value(value=float(length), unit="object sizes")
@@ -260,7 +260,7 @@ class OcclusionControl(Control):
         """Return every occluder that can be chosen; each is a part of the scene."""
         if self.chosen["object"] is not None:
             return (str(self.chosen["object"]),)
-        return tuple(map(str, self.allowed("which", MADE[0])))
+        return tuple(map(str, self.list_allowed_values("which", PRIMITIVES[0])))
 
     def _select_option(self, values: Values) -> str:
         return (
@@ -276,7 +276,7 @@ class OcclusionControl(Control):
         """
         return self.name if len(self._list_options()) == 1 else f"{self.name}-{option}"
 
-    def placement(self, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
+    def find_placement(self, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
         """Work out where the occluder goes, with camera and object where others put them.
 
         Without derivatives.
@@ -287,7 +287,7 @@ class OcclusionControl(Control):
         if view.directions is None or requested["coverage"] <= 0.0:
             return _make_hidden_placement(requested["size"], requested_distance)
         mesh = _load_asset(self._select_option(values)).mesh
-        turn = geometry.rotation(requested["turn"], 0.0, 0.0)
+        turn = geometry.make_rotation(requested["turn"], 0.0, 0.0)
         points = mesh.vertices.astype(np.float64) @ turn.T
         size, distance = _fit_occluder(
             points, requested["size"], requested_distance, view.near
@@ -297,15 +297,15 @@ class OcclusionControl(Control):
             [points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size],
             axis=1,
         )
-        cover = silhouettes.silhouette(in_camera, mesh.faces)
+        cover = silhouettes.rasterise_silhouette(in_camera, mesh.faces)
         if cover is None:
             return _make_hidden_placement(size, distance)
-        axes = silhouettes.middle_axes(view.directions)
+        axes = silhouettes.compute_center_axes(view.directions)
         passage = silhouettes.Passage(
             view.directions, cover, axes, requested["direction"]
         )
         angle = _find_covering_angle(view, passage, requested["coverage"])
-        hidden = float(passage.coverage(np.array([angle]))[0])
+        hidden = float(passage.compute_coverage(np.array([angle]))[0])
         return Placement(axes, angle, size, distance, hidden, False)
 
 
@@ -317,14 +317,14 @@ def _find_covering_angle(
 ) -> float:
     """Find the angle, radians, at which an occluder hides a fraction of the object.
 
-    Below `EASE` it slides in from outside of the image.
+    Below `EASE_IN_COVERAGE` it slides in from outside of the image.
     """
-    outside = silhouettes.angle_outside(
+    outside = silhouettes.find_angle_outside(
         view.shown, view.rim, passage.cover, passage.axes, passage.direction
     )
-    angle = passage.solve(max(coverage, EASE), outside)
-    if coverage < EASE:
-        angle = outside + (angle - outside) * coverage / EASE
+    angle = passage.find_angle(max(coverage, EASE_IN_COVERAGE), outside)
+    if coverage < EASE_IN_COVERAGE:
+        angle = outside + (angle - outside) * coverage / EASE_IN_COVERAGE
     return angle
 
 
@@ -339,9 +339,9 @@ class _ObjectView:
 
     # (N, 3) in which it is visible, each for the same area; None if it is not in the
     # image
-    directions: assets.Doubles | None
-    shown: assets.Doubles  # (M, 3) directions spread over the full image
-    rim: assets.Doubles  # (K, 3) those at its edge
+    directions: assets.Float64Array | None
+    shown: assets.Float64Array  # (M, 3) directions spread over the full image
+    rim: assets.Float64Array  # (K, 3) those at its edge
     near: float  # distance of its nearest vertex from the camera
     far: float  # distance of the middle of its bounding box
 
@@ -357,15 +357,17 @@ class _ObjectView:
         if model is not None:
             if "camera.lens" in so_far:
                 model = model.with_numbers(so_far["camera.lens"].detach().cpu())
-            spread = _spread_directions(model, (0.0, 1.0), (0.0, 1.0), silhouettes.GRID)
+            spread = _spread_directions(
+                model, (0.0, 1.0), (0.0, 1.0), silhouettes.DIRECTION_GRID
+            )
             rim = spread
             directions = _directions_through_lens(model, points, faces)
         else:
             frame = _image_frame(scene, so_far)
-            silhouette = silhouettes.silhouette(points, faces, frame)
+            silhouette = silhouettes.rasterise_silhouette(points, faces, frame)
             spread = silhouettes.spread_directions(frame)
             rim = frame.corners()
-            directions = None if silhouette is None else silhouette.directions()
+            directions = None if silhouette is None else silhouette.list_directions()
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
         near = float(np.linalg.norm(points, axis=1).min())
         far = float(np.linalg.norm(middle))
@@ -374,9 +376,9 @@ class _ObjectView:
 
 def _object_in_camera(
     scene: SceneDescription, so_far: Mapping[str, Tensor]
-) -> assets.Doubles:
+) -> assets.Float64Array:
     """Return the object's vertices (V, 3) to the right, up and forward of the camera."""
-    camera = geometry.camera_in(scene, so_far).detach().double().cpu().numpy()
+    camera = geometry.get_camera_pose(scene, so_far).detach().double().cpu().numpy()
     pose = _input_or(so_far, "object.to_world", geometry.object_to_world(scene))
     offsets = _input_or(so_far, "object.offsets", np.zeros(3))
     vertices = scene.object.mesh.vertices.astype(np.float64) + offsets
@@ -397,8 +399,10 @@ def _image_frame(
 
 
 def _directions_through_lens(
-    model: geometry.CameraModel, points: assets.Doubles, faces: npt.NDArray[np.uint32]
-) -> assets.Doubles | None:
+    model: geometry.CameraModel,
+    points: assets.Float64Array,
+    faces: npt.NDArray[np.uint32],
+) -> assets.Float64Array | None:
     """Return the directions in which a mesh is seen through a lens.
 
     Args:
@@ -411,8 +415,8 @@ def _directions_through_lens(
         in the image.
     """
     vertex_directions = points / np.linalg.norm(points, axis=1, keepdims=True)
-    axes = silhouettes.middle_axes(vertex_directions)
-    cover = silhouettes.silhouette(points @ axes.T, faces)
+    axes = silhouettes.compute_center_axes(vertex_directions)
+    cover = silhouettes.rasterise_silhouette(points @ axes.T, faces)
     if cover is None:
         return None
     positions, is_visible = model.project(torch.from_numpy(points * (1.0, -1.0, 1.0)))
@@ -432,7 +436,7 @@ def _spread_directions(
     across: tuple[float, float],
     down: tuple[float, float],
     count: int,
-) -> assets.Doubles:
+) -> assets.Float64Array:
     """Return unit directions (N, 3) in which a lens sees a part of the image.
 
     They are spread as those of `Silhouette.directions`.
@@ -449,14 +453,14 @@ def _spread_directions(
     y_in_cells = row + (0.5 + 0.5698403 * index) % 1.0
     x = across[0] + x_in_cells / count * (across[1] - across[0])
     y = down[0] + y_in_cells / count * (down[1] - down[0])
-    directions, inside = model.rays(torch.from_numpy(np.stack([x, y], axis=1)))
+    directions, inside = model.compute_rays(torch.from_numpy(np.stack([x, y], axis=1)))
     visible = directions[inside > 0.0].numpy() * (1.0, -1.0, 1.0)
     return np.asarray(visible / np.linalg.norm(visible, axis=1, keepdims=True))
 
 
 def _input_or(
-    inputs: Mapping[str, Tensor], name: str, otherwise: assets.Doubles
-) -> assets.Doubles:
+    inputs: Mapping[str, Tensor], name: str, otherwise: assets.Float64Array
+) -> assets.Float64Array:
     return inputs[name].detach().double().cpu().numpy() if name in inputs else otherwise
 
 
@@ -464,11 +468,11 @@ def _input_or(
 
 
 def _fit_occluder(
-    points: assets.Doubles, size: float, distance: float, near: float
+    points: assets.Float64Array, size: float, distance: float, near: float
 ) -> tuple[float, float]:
     """Fit an occluder between the camera and the object.
 
-    It keeps `CLEARANCE` from the camera, and no vertex is farther from the camera than
+    It keeps `MIN_CAMERA_DISTANCE` from the camera, and no vertex is farther from the camera than
     the object's nearest one. It is made smaller where it does not fit.
 
     Args:
@@ -483,9 +487,9 @@ def _fit_occluder(
     front = float(points[:, 0].max())
     back = float(-points[:, 0].min())
     half_width = float(np.hypot(points[:, 1], points[:, 2]).max())
-    near = max(near, 3.0 * CLEARANCE)
+    near = max(near, 3.0 * MIN_CAMERA_DISTANCE)
     for _ in range(200):
-        nearest = CLEARANCE + size * front
+        nearest = MIN_CAMERA_DISTANCE + size * front
         squared_reach = near * near - (size * half_width) ** 2
         farthest = 0.0
         if squared_reach > 0.0:
@@ -520,4 +524,4 @@ def _compute_pose(camera: Tensor, placed: Placement, values: Values) -> Tensor:
     to_world = camera[:3, :3] * torch.tensor([-1.0, 1.0, 1.0]).to(camera)
     linear = placed.size * to_world @ torch.stack([x, y, up], dim=1)
     center = camera[:3, 3] + placed.distance * (to_world @ to_occluder)
-    return geometry.affine(linear, center)
+    return geometry.make_affine(linear, center)

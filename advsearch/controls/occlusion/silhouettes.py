@@ -22,9 +22,9 @@ from advsearch.extend import assets, geometry, images
 
 RASTER = 128  # pixels along the longer side of a silhouette
 # angles at which the coverage is looked up before the crossing is narrowed down
-SCAN = 48
-HALVINGS = 12  # steps that narrow it down
-GRID = 24  # rows and columns of the directions that stand for the whole frame
+N_SCAN_ANGLES = 48
+N_BISECTIONS = 12  # steps that narrow it down
+DIRECTION_GRID = 24  # rows and columns of the directions that stand for the whole frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Silhouette:
     mask: NDArray[np.bool_]
     window: geometry.Frame
 
-    def directions(self) -> assets.Doubles:
+    def list_directions(self) -> assets.Float64Array:
         """Return unit directions (N, 3), one in each covered pixel.
 
         All stand for the same area of the image. Their positions within pixels are a
@@ -55,18 +55,21 @@ class Silhouette:
         return _unit(np.stack([x, y, np.ones_like(x)], axis=-1))
 
     def contains(
-        self, x: assets.Doubles, y: assets.Doubles, forwards: assets.Doubles
+        self,
+        x: assets.Float64Array,
+        y: assets.Float64Array,
+        forwards: assets.Float64Array,
     ) -> NDArray[np.bool_]:
         """Return whether directions, any shape and length, lie in the silhouette."""
         height, width = self.mask.shape
         window = self.window
-        depth = np.maximum(forwards, geometry.NEAREST)
+        depth = np.maximum(forwards, geometry.MIN_DEPTH)
         column = np.floor(
             (x / depth - window.left) / (window.right - window.left) * width
         )
         row = np.floor((y / depth - window.low) / (window.high - window.low) * height)
         inside = (
-            (forwards > geometry.NEAREST)
+            (forwards > geometry.MIN_DEPTH)
             & (column >= 0)
             & (column < width)
             & (row >= 0)
@@ -77,8 +80,8 @@ class Silhouette:
         return np.asarray(inside & self.mask[row, column])
 
 
-def silhouette(
-    points: assets.Doubles,
+def rasterise_silhouette(
+    points: assets.Float64Array,
     faces: NDArray[np.uint32],
     frame: geometry.Frame | None = None,
 ) -> Silhouette | None:
@@ -90,7 +93,7 @@ def silhouette(
         frame: what the camera shows; None for all in front of it.
     """
     corners = points[faces.astype(np.int64)]
-    corners = corners[(corners[..., 2] > geometry.NEAREST).all(axis=1)]
+    corners = corners[(corners[..., 2] > geometry.MIN_DEPTH).all(axis=1)]
     if len(corners) == 0:
         return None
     tangents = corners[..., :2] / corners[..., 2:]
@@ -106,14 +109,14 @@ def silhouette(
         width / window_width,
         height / window_height,
     ) - 0.5
-    _, row, column, _ = images.pixels_in(in_pixels, (height, width))
+    _, row, column, _ = images.rasterize_triangles(in_pixels, (height, width))
     mask = np.zeros((height, width), dtype=np.bool_)
     mask[row, column] = True
     return Silhouette(mask, window) if mask.any() else None
 
 
 def _find_window(
-    tangents: assets.Doubles, frame: geometry.Frame | None
+    tangents: assets.Float64Array, frame: geometry.Frame | None
 ) -> geometry.Frame | None:
     """Return the box of tangents (F, 3, 2) within a frame; None if it is empty."""
     left, low = tangents.min(axis=(0, 1))
@@ -132,15 +135,17 @@ def _find_window(
 class Passage:
     """A thing that moves sideways past another, both as the camera sees them."""
 
-    hidden: assets.Doubles  # directions (N, 3) in which what is to be hidden is seen
+    hidden: (
+        assets.Float64Array
+    )  # directions (N, 3) in which what is to be hidden is seen
     cover: Silhouette  # of the moving thing, straight ahead of the camera
     # (3, 3) rows: where its right, up and forward point when it is in the middle of the
     # other
-    axes: assets.Doubles
+    axes: assets.Float64Array
     # from which side it comes: degrees, 0 from the right of the picture, 90 from above
     direction: float
 
-    def coverage(self, angles: assets.Doubles) -> assets.Doubles:
+    def compute_coverage(self, angles: assets.Float64Array) -> assets.Float64Array:
         """Return the hidden fraction (K,) at angles (K,) in radians from the middle."""
         turn = math.radians(self.direction)
         right, up, forward = (self.hidden @ self.axes.T).T
@@ -155,40 +160,42 @@ class Passage:
             fractions.append(float(self.cover.contains(x, y, depth).mean()))
         return np.array(fractions)
 
-    def solve(self, wanted: float, outside: float) -> float:
+    def find_angle(self, fraction: float, outside: float) -> float:
         """Find the largest angle at which a fraction is hidden, by bisection.
 
         The thing comes in from outside, and stops where it first hides as much. If it never
         does, the angle at which it hides most is returned.
 
         Args:
-            wanted: the fraction.
+            fraction: the fraction.
             outside: angle at which it is outside of the image, radians.
         """
-        angles = np.linspace(outside, 0.0, SCAN)
-        fractions = self.coverage(angles)
-        enough = np.nonzero(fractions >= wanted)[0]
+        angles = np.linspace(outside, 0.0, N_SCAN_ANGLES)
+        fractions = self.compute_coverage(angles)
+        enough = np.nonzero(fractions >= fraction)[0]
         if len(enough) == 0:
             return float(angles[int(np.argmax(fractions))])
         if enough[0] == 0:
             return float(angles[0])
         too_far = float(angles[enough[0] - 1])
         close_enough = float(angles[enough[0]])
-        for _ in range(HALVINGS):
+        for _ in range(N_BISECTIONS):
             middle = 0.5 * (too_far + close_enough)
-            if float(self.coverage(np.array([middle]))[0]) >= wanted:
+            if float(self.compute_coverage(np.array([middle]))[0]) >= fraction:
                 close_enough = middle
             else:
                 too_far = middle
         return 0.5 * (too_far + close_enough)
 
 
-def spread_directions(frame: geometry.Frame) -> assets.Doubles:
+def spread_directions(frame: geometry.Frame) -> assets.Float64Array:
     """Return unit directions (N, 3) that stand for all that a frame shows."""
-    return Silhouette(np.ones((GRID, GRID), dtype=np.bool_), frame).directions()
+    return Silhouette(
+        np.ones((DIRECTION_GRID, DIRECTION_GRID), dtype=np.bool_), frame
+    ).list_directions()
 
 
-def middle_axes(hidden: assets.Doubles) -> assets.Doubles:
+def compute_center_axes(hidden: assets.Float64Array) -> assets.Float64Array:
     """Return a camera's axes (3, 3) turned to look at the middle of a silhouette.
 
     Rows right, up, forward.
@@ -201,17 +208,17 @@ def middle_axes(hidden: assets.Doubles) -> assets.Doubles:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def angle_outside(
-    shown: assets.Doubles,
-    rim: assets.Doubles,
+def find_angle_outside(
+    directions: assets.Float64Array,
+    rim: assets.Float64Array,
     cover: Silhouette,
-    axes: assets.Doubles,
+    axes: assets.Float64Array,
     direction: float,
 ) -> float:
     """Return the angle in radians beyond which a thing is out of the image on its side.
 
     Args:
-        shown: (N, 3) directions spread over the full image.
+        directions: (N, 3) directions spread over the full image.
         rim: (M, 3) directions at the edge of the image.
         cover: the thing, as of `Passage`.
         axes: as of `Passage`.
@@ -221,13 +228,13 @@ def angle_outside(
     radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
     reach = float(np.arccos(np.clip(rim @ axes[2], -1.0, 1.0)).max())
     farthest = min(reach + radius + 0.02, 0.9 * math.pi)
-    angles = np.linspace(farthest, 0.0, 2 * SCAN)
-    covered = Passage(shown, cover, axes, direction).coverage(angles)
+    angles = np.linspace(farthest, 0.0, 2 * N_SCAN_ANGLES)
+    covered = Passage(directions, cover, axes, direction).compute_coverage(angles)
     inside = np.nonzero(covered > 0.0)[0]
     if not len(inside):
         return float(angles[0])
     return float(angles[max(int(inside[0]) - 1, 0)])
 
 
-def _unit(vectors: assets.Doubles) -> assets.Doubles:
+def _unit(vectors: assets.Float64Array) -> assets.Float64Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

@@ -25,10 +25,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from advsearch.controls.path.pose_files import (
-    AXES_MEAN,
+    AXES_DESCRIPTIONS,
     KITTI_RATE,
+    NO_AXES,
     OPTICAL,
-    UNUSED,
     WORLD_TO_Z_UP,
     PoseFormat,
     Trajectory,
@@ -53,40 +53,40 @@ from advsearch.extend import (
 
 APPROACH = "approach"
 PASS = "pass"
-TURN = "orbit"
-PATHS = (APPROACH, PASS, TURN)
-CAMERA, THING = MOVERS = "camera", "object"
+ORBIT = "orbit"
+PATHS = (APPROACH, PASS, ORBIT)
+CAMERA, OBJECT = MOVERS = "camera", "object"
 # of files with a path, in small letters
 PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")
-BOTH = "+"  # between the camera's path and the object's
-SEVERAL = ","  # between paths of which one is drawn
-MOST_PATHS = 64
+MOVER_SEPARATOR = "+"  # between the camera's path and the object's
+PATH_SEPARATOR = ","  # between paths of which one is drawn
+MAX_PATHS = 64
 # share of the time at which the scene is as it is described
-CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}
+CLEAN_TIME_FRACTION = {APPROACH: 1.0, PASS: 0.5, ORBIT: 0.0}
 
-REACH = 4.0
-SECONDS = 10.0
-SHORTEST = 1e-3  # seconds between waypoints at least, and of a path at most
-LONGEST = 3600.0
+DEFAULT_REACH = 4.0
+DEFAULT_SECONDS = 10.0
+MIN_SECONDS = 1e-3  # seconds between waypoints at least, and of a path at most
+MAX_SECONDS = 3600.0
 # share of the least time between waypoints that may be lost where times are written in
 # decimals
-ROUNDED = 1e-3
+ROUNDING_FRACTION = 1e-3
 # object sizes from the camera to what it looks at, at least: nearer, it looks nowhere
-NEAREST = 1e-3
+MIN_TARGET_DISTANCE = 1e-3
 # times at which curved paths are looked at; a file's waypoints are in addition
-LOOKS = 2048
-TIME = "time"
-PLACE = ("x", "y", "z")
-LOOKING = ("look_x", "look_y", "look_z")
-HEADING = "heading"
-SHIFT = ("object_x", "object_y", "object_z")
-TURNING = "object_heading"
+N_CHECKED_TIMES = 2048
+TIME_COLUMN = "time"
+POSITION_COLUMNS = ("x", "y", "z")
+TARGET_COLUMNS = ("look_x", "look_y", "look_z")
+HEADING_COLUMN = "heading"
+OBJECT_SHIFT_COLUMNS = ("object_x", "object_y", "object_z")
+OBJECT_HEADING_COLUMN = "object_heading"
 """Columns of the object in a file that is about both."""
-MOST_WAYPOINTS = 100_000
-MOST_BYTES = 16 * 2**20
+MAX_WAYPOINTS = 100_000
+MAX_FILE_BYTES = 16 * 2**20
 TRAJECTORY_CHOICES = ("axes", "up", "object_at")
 MAX_TILT = 60.0  # degrees from up, on average, over which other axes are likelier
-FARTHEST = 1e5  # metres, or object sizes, that a waypoint may be away
+MAX_DISTANCE = 1e5  # metres, or object sizes, that a waypoint may be away
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ class Waypoints:
     times: Tensor  # (n,) ascending, seconds from the first
     # (n, 3) from the middle of where the object stands; of an object that moves, its
     # shift
-    places: Tensor
+    positions: Tensor
     # (n, 3) what the camera looks at, from the same middle; None for the middle itself
     targets: Tensor | None
     headings: Tensor | None  # (n,) degrees that the object is turned by; None for none
@@ -110,12 +110,12 @@ class Waypoints:
     is_trajectory: bool = False
     notes: tuple[str, ...] = ()  # sentences about how it is read
 
-    def at(self, time: Tensor, of: Tensor) -> Tensor:
+    def interpolate(self, time: Tensor, column: Tensor) -> Tensor:
         """Interpolate a column, or several, linearly between waypoints.
 
         Args:
             time: (...,) seconds; the result is differentiable in it.
-            of: (n,) or (n, k) at the waypoints.
+            column: (n,) or (n, k) at the waypoints.
 
         Returns:
             (...,) or (..., k).
@@ -125,20 +125,20 @@ class Waypoints:
         begin = self.times[index - 1]
         end = self.times[index]
         fraction = ((time - begin) / (end - begin)).clamp(0.0, 1.0)
-        if of.ndim > 1:
+        if column.ndim > 1:
             fraction = fraction[..., None]
-        return torch.lerp(of[index - 1], of[index], fraction)
+        return torch.lerp(column[index - 1], column[index], fraction)
 
-    def rotation_at(self, time: Tensor) -> Tensor:
+    def interpolate_rotation(self, time: Tensor) -> Tensor:
         """Return the rotation (..., 3, 3) at times (...,).
 
         Its columns are the camera's right, down and ahead.
         """
         assert self.rotations is not None
-        quaternion = self.at(time, self.rotations)
+        quaternion = self.interpolate(time, self.rotations)
         quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(1e-9)
         entries = torch.stack(
-            geometry.entries_of_turn(*quaternion.unbind(dim=-1)), dim=-1
+            geometry.rotation_entries(*quaternion.unbind(dim=-1)), dim=-1
         )
         return entries.reshape(*entries.shape[:-1], 3, 3)
 
@@ -151,9 +151,11 @@ class Start(NamedTuple):
     object: Tensor
 
 
-Way = str | Waypoints  # one of `PATHS`, or that of a file
+Movement = str | Waypoints  # one of `PATHS`, or that of a file
 
-Ways = Mapping[str, Way]  # what the camera, the object or both do, by `MOVERS`
+MovementByMover = Mapping[
+    str, Movement
+]  # what the camera, the object or both do, by `MOVERS`
 
 
 class PathControl(Control):
@@ -167,7 +169,7 @@ class PathControl(Control):
             "time",
             "s",
             0.0,
-            LONGEST,
+            MAX_SECONDS,
             "where the scene is as it is",
             "Time since the path began.",
         ),
@@ -192,13 +194,13 @@ class PathControl(Control):
         ),
         Choice(
             "seconds",
-            SECONDS,
+            DEFAULT_SECONDS,
             "How long it takes; a file says so itself, but for KITTI's poses.",
-            most=LONGEST,
+            most=MAX_SECONDS,
         ),
         Choice(
             "reach",
-            REACH,
+            DEFAULT_REACH,
             "How far it goes, in distances of the scene's own camera: where "
             "approach begins, half of what pass "
             "takes.",
@@ -228,7 +230,7 @@ class PathControl(Control):
             "flu (x ahead, y left, z up), frd (x ahead, y right, z down), euroc (x "
             "up, y right, z ahead), or none: "
             "the camera looks at the object. By default optical.",
-            options=tuple(AXES_MEAN),
+            options=tuple(AXES_DESCRIPTIONS),
         ),
         Choice(
             "up",
@@ -246,26 +248,28 @@ class PathControl(Control):
     )
 
     @classmethod
-    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+    def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the time, and of several paths which it is."""
         if not isinstance(settings, Mapping):
             return cls.parameters
         names = _split_paths(settings.get("path", APPROACH))
         if len(names) < 2:
             return cls.parameters
-        choice = Parameter.named(Control.WAY, names, names[0], "Which of the paths.")
+        choice = Parameter.named(
+            Control.PATH_PARAMETER, names, names[0], "Which of the paths."
+        )
         return (*cls.parameters, choice)
 
     def check_choices(self) -> None:
         """Read the paths, and check the choices that go with them."""
         names = _split_paths(self.chosen["path"])
-        if len(set(names)) < len(names) or len(names) > MOST_PATHS:
+        if len(set(names)) < len(names) or len(names) > MAX_PATHS:
             raise InputError(
-                f"{self.name}.path: expected at most {MOST_PATHS} "
+                f"{self.name}.path: expected at most {MAX_PATHS} "
                 f"different paths, got {', '.join(names)}"
             )
         self._check_object_at()
-        self._paths: tuple[Ways, ...] = tuple(map(self._read_path, names))
+        self._paths: tuple[MovementByMover, ...] = tuple(map(self._read_path, names))
         self._movers = {mover for movements in self._paths for mover in movements}
         all_movements = [
             movement for movements in self._paths for movement in movements.values()
@@ -273,13 +277,13 @@ class PathControl(Control):
         self._files = [
             movement for movement in all_movements if isinstance(movement, Waypoints)
         ]
-        has_single_path = any(BOTH not in name for name in names)
-        if "moves" in self._given and not has_single_path:
+        has_single_path = any(MOVER_SEPARATOR not in name for name in names)
+        if "moves" in self._settings and not has_single_path:
             raise InputError(
                 f"{self.name}: {names[0]} says what the camera does and "
                 "what the object; leave moves out"
             )
-        if "path" in self._given:  # otherwise the run may say it, later
+        if "path" in self._settings:  # otherwise the run may say it, later
             self._check_needless()
         if any(movement.has_times for movement in self._files):
             self._check_not_set("seconds")
@@ -293,16 +297,16 @@ class PathControl(Control):
 
     def _check_not_set(self, setting: str) -> None:
         """Check that a choice which files state is not set. Raises InputError: it is."""
-        if setting in self._given:
+        if setting in self._settings:
             raise InputError(
                 f"{self.name}: {setting}: the file in {self.chosen['path']} says "
                 "that itself; leave it out"
             )
 
-    def _read_path(self, name: str) -> Ways:
+    def _read_path(self, name: str) -> MovementByMover:
         """Return what the path of a name makes of camera and object."""
         names = [name]
-        both = name.split(BOTH)
+        both = name.split(MOVER_SEPARATOR)
         if len(both) == 2 and all(map(_is_path, both)):
             names = both
         alone = len(names) == 1
@@ -310,11 +314,11 @@ class PathControl(Control):
             raise InputError(
                 f"{self.name}.path: expected {', '.join(PATHS)}, a "
                 f"{' or '.join(PATH_ENDINGS)} file, or two of them as "
-                f"in {APPROACH}{BOTH}{TURN}, the camera's and the object's, got "
+                f"in {APPROACH}{MOVER_SEPARATOR}{ORBIT}, the camera's and the object's, got "
                 f"{name!r}"
             )
         movers = [str(self.chosen["moves"])] if alone else MOVERS
-        movements: dict[str, Way] = {}
+        movements: dict[str, Movement] = {}
         for mover, path_name in zip(movers, names, strict=True):
             if path_name in PATHS:
                 movements[mover] = path_name
@@ -348,12 +352,12 @@ class PathControl(Control):
                 f"[20, 0, 0], got {position!r}"
             )
 
-    def _read_file(self, path: Path, mover: str, alone: bool) -> Ways:
+    def _read_file(self, path: Path, mover: str, alone: bool) -> MovementByMover:
         """Read the file of a path: a trajectory, or a table of waypoints."""
         text = _read_text(path)
         trajectory = read_trajectory(path, text)
         if trajectory is None:
-            return read_waypoints(path, mover, text=text, alone=alone)
+            return read_waypoints(path, mover, text=text, is_single_path=alone)
         if mover != CAMERA:
             raise errors.FileFormatError(
                 f"{path}: {trajectory.format.value} is about the camera, and here the "
@@ -407,13 +411,13 @@ class PathControl(Control):
 
     def _times_of(
         self, trajectory: Trajectory, assumed: dict[str, str]
-    ) -> assets.Doubles:
+    ) -> assets.Float64Array:
         """Return the times (n,) of a trajectory, in seconds; note what is assumed."""
         if trajectory.times is not None:
             return trajectory.times
         count = len(trajectory.positions)
         seconds = (count - 1) / KITTI_RATE
-        if "seconds" in self._given:
+        if "seconds" in self._settings:
             seconds = float(self.chosen["seconds"])
         else:
             assumed["seconds"] = (
@@ -423,7 +427,7 @@ class PathControl(Control):
 
     def _orient(
         self, path: Path, trajectory: Trajectory, assumed: dict[str, str]
-    ) -> tuple[assets.Doubles, Rotation | None]:
+    ) -> tuple[assets.Float64Array, Rotation | None]:
         """Return positions and rotations as `Trajectory.orient`; note what is assumed.
 
         Raises:
@@ -433,30 +437,33 @@ class PathControl(Control):
         axes = str(self.chosen["axes"] or OPTICAL)
         up = str(self.chosen["up"] or trajectory.default_up)
         origin = self.chosen["object_at"] or (0.0, 0.0, 0.0)
-        if trajectory.rotations is None and axes == UNUSED:
+        if trajectory.rotations is None and axes == NO_AXES:
             raise InputError(
                 f"{self.name}: axes: {path} has no rotations; leave it out"
             )
         if self.chosen["axes"] is None and trajectory.rotations is not None:
-            assumed["axes"] = f"{axes} ({AXES_MEAN[axes]})"
+            assumed["axes"] = f"{axes} ({AXES_DESCRIPTIONS[axes]})"
         if self.chosen["up"] is None:
             assumed["up"] = up
         if self.chosen["object_at"] is None:
             assumed["object_at"] = "[0, 0, 0]"
         positions, rotations = trajectory.orient(axes, up, origin)
-        if np.abs(positions).max() > FARTHEST:
+        if np.abs(positions).max() > MAX_DISTANCE:
             raise errors.FileFormatError(
-                f"{path}: expected positions within {FARTHEST:g} of the object, got "
+                f"{path}: expected positions within {MAX_DISTANCE:g} of the object, got "
                 "larger ones; object_at says where "
                 "that is in the file's world"
             )
         return positions, rotations
 
-    def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
+    def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
         # whatever else is asked for
-        if parameter.name == Control.WAY and Control.WAY not in self.specs:
+        if (
+            parameter.name == Control.PATH_PARAMETER
+            and Control.PATH_PARAMETER not in self.specs
+        ):
             return OneOf(parameter.options)
-        return super().spec(parameter)
+        return super().get_spec(parameter)
 
     _time_shift = 0.0
 
@@ -470,7 +477,7 @@ class PathControl(Control):
             self.chosen["rolling"] or 0.0
         )
 
-    def later(self, seconds: float) -> PathControl:
+    def advance_time(self, seconds: float) -> PathControl:
         shifted = copy.copy(self)
         shifted._time_shift = self._time_shift + seconds
         return shifted
@@ -481,14 +488,14 @@ class PathControl(Control):
         Raises InputError: another control or camera has the camera, or a path is
         impossible.
         """
-        if CAMERA in self._movers and not scene.is_seen_from_orbit:
+        if CAMERA in self._movers and not scene.uses_orbit_camera:
             raise InputError(
                 f"`controls` {self.name}: moves the camera, and the scene is seen by "
                 f"its camera {scene.camera!r}; give "
                 f"moves=object, or have it seen by 'orbit'"
             )
         self._check_needless()
-        in_scene = self.within(scene)
+        in_scene = self.with_scene(scene)
         names = _split_paths(self.chosen["path"])
         for name, movements in zip(names, self._paths, strict=True):
             if CAMERA in movements:
@@ -507,7 +514,7 @@ class PathControl(Control):
         remarks = tuple(dict.fromkeys((*scene.remarks, *notes)))
         return replace(scene, remarks=remarks)
 
-    def _check_looks(self, name: str, movements: Ways) -> None:
+    def _check_looks(self, name: str, movements: MovementByMover) -> None:
         """Check that the camera is never at what it looks at, also between waypoints.
 
         Raises InputError: it is.
@@ -517,8 +524,10 @@ class PathControl(Control):
             for movement in movements.values()
             if isinstance(movement, Waypoints)
         ]
-        time = torch.cat([torch.linspace(0.0, self.seconds, LOOKS), *files]).unique()
-        begin = start_of(self.scene, time.device)
+        time = torch.cat(
+            [torch.linspace(0.0, self.seconds, N_CHECKED_TIMES), *files]
+        ).unique()
+        begin = get_start_poses(self.scene, time.device)
         shift, _ = self._shift_object(movements, begin, time)
         position, target = self._position_camera(movements, begin, time, shift)
         gap = (target - position).expand(len(time), 3).double()
@@ -529,7 +538,7 @@ class PathControl(Control):
         )
         fraction = fraction.clamp(0.0, 1.0)
         distance = (gap[:-1] + fraction[:, None] * step).norm(dim=1)
-        if float(distance.min()) < NEAREST:
+        if float(distance.min()) < MIN_TARGET_DISTANCE:
             index = int(distance.argmin())
             seconds = float(
                 torch.lerp(time[index], time[index + 1], fraction[index].float())
@@ -542,15 +551,15 @@ class PathControl(Control):
                 "look_z)"
             )
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return the time, with the path's range, and the clean time as its default."""
-        if parameter.name == Control.WAY:
+        if parameter.name == Control.PATH_PARAMETER:
             return parameter
         first, *last = self._paths[0].values()
         # who goes around is back at the end
-        movement = last[0] if last and first == TURN else first
+        movement = last[0] if last and first == ORBIT else first
         clean_time = (
-            CLEAN_AT.get(movement, 0.0) * self.seconds
+            CLEAN_TIME_FRACTION.get(movement, 0.0) * self.seconds
             if isinstance(movement, str)
             else 0.0
         )
@@ -568,7 +577,7 @@ class PathControl(Control):
         """Return the poses of the camera, the object or both at the time."""
         time = values["time"] + self._time_shift
         movements = self._select_movements(values)
-        start = start_of(self.scene, time.device)
+        start = get_start_poses(self.scene, time.device)
         shift, heading = self._shift_object(movements, start, time)
         inputs = {}
         if CAMERA in self._movers:
@@ -576,12 +585,14 @@ class PathControl(Control):
             roll = self.scene.number("camera.roll")
             movement = movements.get(CAMERA)
             if isinstance(movement, Waypoints) and movement.rotations is not None:
-                pose = pose_camera(position, movement.rotation_at(time), roll)
+                pose = make_camera_pose(
+                    position, movement.interpolate_rotation(time), roll
+                )
             else:
-                pose = looking(position, target, roll)
+                pose = make_look_at_pose(position, target, roll)
             inputs["camera.to_world"] = pose
-        if THING in self._movers:
-            inputs["object.to_world"] = turned(start, shift, heading)
+        if OBJECT in self._movers:
+            inputs["object.to_world"] = make_object_pose(start, shift, heading)
         return inputs
 
     def measured(
@@ -592,7 +603,7 @@ class PathControl(Control):
         distance = self._camera_distance(self._select_movements(values), values["time"])
         return {"distance": Value(value=float(distance), unit=unit)}
 
-    def distances(self, times: Tensor) -> Tensor:
+    def compute_distances(self, times: Tensor) -> Tensor:
         """Return the distances of the camera from the object on each of the paths.
 
         Args:
@@ -608,21 +619,25 @@ class PathControl(Control):
             ]
         )
 
-    def _camera_distance(self, movements: Ways, time: Tensor) -> Tensor:
-        start = start_of(self.scene, time.device)
+    def _camera_distance(self, movements: MovementByMover, time: Tensor) -> Tensor:
+        start = get_start_poses(self.scene, time.device)
         shift, _ = self._shift_object(movements, start, time)
         position, _ = self._position_camera(movements, start, time, shift)
         offset = position - start.middle - shift
         distance: Tensor = offset.norm(dim=-1).double() * self.scene.metres
         return distance
 
-    def _select_movements(self, values: Values) -> Ways:
-        if Control.WAY in values:
-            return self._paths[int(values[Control.WAY])]
+    def _select_movements(self, values: Values) -> MovementByMover:
+        if Control.PATH_PARAMETER in values:
+            return self._paths[int(values[Control.PATH_PARAMETER])]
         return self._paths[0]
 
     def _position_camera(
-        self, movements: Ways, scene_start: Start, time: Tensor, shift: Tensor
+        self,
+        movements: MovementByMover,
+        scene_start: Start,
+        time: Tensor,
+        shift: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Return where the camera is, and what it looks at.
 
@@ -661,32 +676,35 @@ class PathControl(Control):
         self, waypoints: Waypoints, center: Tensor, time: Tensor, shift: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return where the camera is on waypoints, and what it looks at; see `_position_camera`."""
-        position = center + waypoints.at(time, waypoints.places) / self.scene.metres
+        position = (
+            center
+            + waypoints.interpolate(time, waypoints.positions) / self.scene.metres
+        )
         if waypoints.rotations is not None:
-            return position, position + waypoints.rotation_at(time)[..., 2]
+            return position, position + waypoints.interpolate_rotation(time)[..., 2]
         if waypoints.targets is None:
             return position, center + shift
-        target = waypoints.at(time, waypoints.targets) / self.scene.metres
+        target = waypoints.interpolate(time, waypoints.targets) / self.scene.metres
         return position, center + target
 
     def _shift_object(
-        self, movements: Ways, scene_start: Start, time: Tensor
+        self, movements: MovementByMover, scene_start: Start, time: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return how far the object is shifted, and the degrees that it is turned by."""
         camera = scene_start.camera
-        movement = movements.get(THING)
+        movement = movements.get(OBJECT)
         no_shift = camera.new_zeros(3)
         no_turn = camera.new_zeros(())
         if movement is None:
             return no_shift, no_turn
         if isinstance(movement, Waypoints):
-            shift = movement.at(time, movement.places) / self.scene.metres
+            shift = movement.interpolate(time, movement.positions) / self.scene.metres
             if movement.headings is None:
                 return shift, no_turn
-            return shift, movement.at(time, movement.headings)
+            return shift, movement.interpolate(time, movement.headings)
         progress = (time / self.seconds).clamp(0.0, 1.0)
         reach = float(self.chosen["reach"])
-        if movement == TURN:
+        if movement == ORBIT:
             return no_shift, 360.0 * progress
         distance = (camera[:3, 3] - scene_start.middle).norm()
         if movement == APPROACH:
@@ -697,11 +715,11 @@ class PathControl(Control):
 
 
 @lru_cache(maxsize=4)
-def start_of(scene: SceneDescription, device: torch.device) -> Start:
+def get_start_poses(scene: SceneDescription, device: torch.device) -> Start:
     """Return the poses of a scene; cached, as it looks at every vertex."""
     poses = (
         geometry.camera_to_world(scene),
-        geometry.middle(scene),
+        geometry.compute_center(scene),
         geometry.object_to_world(scene),
     )
     return Start(*(torch.from_numpy(pose).float().to(device) for pose in poses))
@@ -724,32 +742,32 @@ def _turn_about_vertical(offset: Tensor, turns: Tensor) -> Tensor:
     )
 
 
-def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
+def make_look_at_pose(position: Tensor, target: Tensor, roll: float) -> Tensor:
     """Return the pose (4, 4) of a camera that looks at a target.
 
     Args:
-        place: (3,) of the camera.
+        position: (3,) of the camera.
         target: (3,).
         roll: degrees.
     """
-    ahead = (target - place) / (target - place).norm().clamp_min(1e-9)
+    ahead = (target - position) / (target - position).norm().clamp_min(1e-9)
     level = torch.stack([-ahead[1], ahead[0], torch.zeros_like(ahead[0])])
     # where it looks straight up or down
     aside = torch.tensor([0.0, 1.0, 0.0]).to(ahead)
     left = torch.where(level.norm() > 1e-6, level / level.norm().clamp_min(1e-6), aside)
-    return _roll_camera(place, left, torch.linalg.cross(ahead, left), ahead, roll)
+    return _roll_camera(position, left, torch.linalg.cross(ahead, left), ahead, roll)
 
 
-def pose_camera(place: Tensor, rotation: Tensor, roll: float) -> Tensor:
+def make_camera_pose(position: Tensor, rotation: Tensor, roll: float) -> Tensor:
     """Return the pose (4, 4) of a camera with a rotation.
 
     Args:
-        place: (3,) of the camera.
+        position: (3,) of the camera.
         rotation: (3, 3), columns right, down and ahead.
         roll: degrees.
     """
     right, down, ahead = rotation.unbind(dim=-1)
-    return _roll_camera(place, -right, -down, ahead, roll)
+    return _roll_camera(position, -right, -down, ahead, roll)
 
 
 def _roll_camera(
@@ -757,7 +775,7 @@ def _roll_camera(
 ) -> Tensor:
     cos = math.cos(math.radians(roll))
     sin = math.sin(math.radians(roll))
-    return geometry.affine(
+    return geometry.make_affine(
         torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1),
         position,
     )
@@ -769,7 +787,7 @@ def measure_tilt(rotations: Rotation) -> float:
     return math.degrees(math.acos(float(np.clip(upwards.mean(), -1.0, 1.0))))
 
 
-def align_quaternions(quaternions: assets.Doubles) -> assets.Doubles:
+def align_quaternions(quaternions: assets.Float64Array) -> assets.Float64Array:
     """Return quaternions (n, 4) whose signs do not change from one to the next.
 
     Each is nearer to the one before than its opposite is.
@@ -779,27 +797,27 @@ def align_quaternions(quaternions: assets.Doubles) -> assets.Doubles:
     return np.asarray(quaternions * signs[:, None])
 
 
-def check_times(path: Path, times: assets.Doubles) -> None:
+def check_times(path: Path, times: assets.Float64Array) -> None:
     """Check times (n,) in seconds from the first on.
 
     Raises FileFormatError: they are too few or many, or do not ascend within limits.
     """
-    if not 2 <= len(times) <= MOST_WAYPOINTS:
+    if not 2 <= len(times) <= MAX_WAYPOINTS:
         raise errors.FileFormatError(
-            f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(times)}"
+            f"{path}: expected 2 to {MAX_WAYPOINTS} waypoints, got {len(times)}"
         )
     if not (
         np.isfinite(times).all()
-        and (np.diff(times) >= SHORTEST * (1.0 - ROUNDED)).all()
-        and times[-1] <= LONGEST
+        and (np.diff(times) >= MIN_SECONDS * (1.0 - ROUNDING_FRACTION)).all()
+        and times[-1] <= MAX_SECONDS
     ):
         raise errors.FileFormatError(
-            f"{path}: expected times that ascend, by {SHORTEST:g} s at least and "
-            f"{LONGEST:g} s in all, got others"
+            f"{path}: expected times that ascend, by {MIN_SECONDS:g} s at least and "
+            f"{MAX_SECONDS:g} s in all, got others"
         )
 
 
-def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
+def make_object_pose(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
     """Return the pose (4, 4) of an object that is turned and shifted.
 
     Args:
@@ -807,15 +825,17 @@ def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
         shift: (3,) object sizes.
         heading: () degrees about the vertical through its middle.
     """
-    about = geometry.euler(heading, *heading.new_zeros(2))
+    about = geometry.make_euler_rotation(heading, *heading.new_zeros(2))
     center = start.middle
     posed: Tensor = (
-        geometry.affine(about, center - about @ center + shift) @ start.object
+        geometry.make_affine(about, center - about @ center + shift) @ start.object
     )
     return posed
 
 
-def the_shorter_way(degrees: assets.Doubles) -> tuple[assets.Doubles, str | None]:
+def unwrap_headings(
+    degrees: assets.Float64Array,
+) -> tuple[assets.Float64Array, str | None]:
     """Return headings (n,) that go to the next one the shorter way round, and a note.
 
     Only where all are within one turn, from 0 to 360 or from -180 to 180: others count
@@ -843,7 +863,7 @@ def _format_rounded(number: float) -> str:
 
 def _split_paths(path: object) -> tuple[str, ...]:
     """Return the paths in a list, or in a text with commas between them."""
-    names = path if isinstance(path, list | tuple) else str(path).split(SEVERAL)
+    names = path if isinstance(path, list | tuple) else str(path).split(PATH_SEPARATOR)
     return tuple(str(name).strip() for name in names)
 
 
@@ -854,7 +874,7 @@ def _is_path(name: str) -> bool:
 def _read_text(path: Path) -> str:
     try:
         return stored_files.read_text(
-            path, "a table of waypoints", MOST_BYTES
+            path, "a table of waypoints", MAX_FILE_BYTES
         ).removeprefix("\ufeff")
     except OSError as error:
         raise errors.FileFormatError(
@@ -863,7 +883,7 @@ def _read_text(path: Path) -> str:
 
 
 def read_waypoints(
-    path: Path, mover: str, *, text: str, alone: bool = True
+    path: Path, mover: str, *, text: str, is_single_path: bool = True
 ) -> dict[str, Waypoints]:
     """Read the paths of all that travels from a table of waypoints.
 
@@ -872,7 +892,7 @@ def read_waypoints(
         mover: the camera or the object, which the file is about.
         text: of a .csv file with the columns time, x, y, z, and look_x, look_y, look_z
             or heading.
-        alone: whether a file about the camera may say what the object does at the same
+        is_single_path: whether a file about the camera may say what the object does at the same
             times.
 
     Raises:
@@ -880,45 +900,47 @@ def read_waypoints(
             or its times do not ascend.
     """
     optional: tuple[str, ...]
-    if mover == THING:
-        optional = (HEADING,)
-    elif alone:
-        optional = (*LOOKING, *SHIFT, TURNING)
+    if mover == OBJECT:
+        optional = (HEADING_COLUMN,)
+    elif is_single_path:
+        optional = (*TARGET_COLUMNS, *OBJECT_SHIFT_COLUMNS, OBJECT_HEADING_COLUMN)
     else:
-        optional = LOOKING
+        optional = TARGET_COLUMNS
     header, rows = _read_csv(path, text)
     _check_header(path, header, optional)
     table = _parse_numbers(path, header, rows)
-    times = table[:, header.index(TIME)] - table[0, header.index(TIME)]
+    times = table[:, header.index(TIME_COLUMN)] - table[0, header.index(TIME_COLUMN)]
     check_times(path, times)
     column = {
-        name: table[:, index] for index, name in enumerate(header) if name != TIME
+        name: table[:, index]
+        for index, name in enumerate(header)
+        if name != TIME_COLUMN
     }
-    if not all(np.abs(values).max() <= FARTHEST for values in column.values()):
+    if not all(np.abs(values).max() <= MAX_DISTANCE for values in column.values()):
         raise errors.FileFormatError(
-            f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none"
+            f"{path}: expected numbers within {MAX_DISTANCE:g}, got larger ones, or none"
         )
     notes = _unwrap_headings(path, column)
 
-    positions = _stack_columns(column, PLACE)
+    positions = _stack_columns(column, POSITION_COLUMNS)
     seconds = torch.from_numpy(times.astype(np.float32))
     assert positions is not None
     waypoints = {
         mover: Waypoints(
             seconds,
             positions,
-            _stack_columns(column, LOOKING),
-            _stack_columns(column, (HEADING,)),
-            notes=notes.get(HEADING, ()),
+            _stack_columns(column, TARGET_COLUMNS),
+            _stack_columns(column, (HEADING_COLUMN,)),
+            notes=notes.get(HEADING_COLUMN, ()),
         )
     }
-    shift = _stack_columns(column, SHIFT)
-    turn = _stack_columns(column, (TURNING,))
+    shift = _stack_columns(column, OBJECT_SHIFT_COLUMNS)
+    turn = _stack_columns(column, (OBJECT_HEADING_COLUMN,))
     if shift is None and turn is not None:
         shift = torch.zeros_like(positions)
     if shift is not None:
-        waypoints[THING] = Waypoints(
-            seconds, shift, None, turn, notes=notes.get(TURNING, ())
+        waypoints[OBJECT] = Waypoints(
+            seconds, shift, None, turn, notes=notes.get(OBJECT_HEADING_COLUMN, ())
         )
     return waypoints
 
@@ -941,13 +963,14 @@ def _read_csv(path: Path, text: str) -> tuple[list[str], list[list[str]]]:
 
 def _check_header(path: Path, header: list[str], optional: tuple[str, ...]) -> None:
     """Check the names of columns. Raises FileFormatError: some lack, or are unknown."""
-    required = (TIME, *PLACE)
+    required = (TIME_COLUMN, *POSITION_COLUMNS)
     names = set(header)
     is_missing = not set(required) <= names
     has_duplicates = len(names) < len(header)
     is_unknown = not names <= {*required, *optional}
     is_incomplete = any(
-        0 < len(names.intersection(group)) < len(group) for group in (LOOKING, SHIFT)
+        0 < len(names.intersection(group)) < len(group)
+        for group in (TARGET_COLUMNS, OBJECT_SHIFT_COLUMNS)
     )
     if is_missing or has_duplicates or is_unknown or is_incomplete:
         raise errors.FileFormatError(
@@ -960,14 +983,14 @@ def _check_header(path: Path, header: list[str], optional: tuple[str, ...]) -> N
 
 def _parse_numbers(
     path: Path, header: list[str], rows: list[list[str]]
-) -> assets.Doubles:
+) -> assets.Float64Array:
     """Return the numbers (rows, columns) of a table of waypoints.
 
     Raises FileFormatError: it has too few or many rows, or something else than numbers.
     """
-    if not 2 <= len(rows) <= MOST_WAYPOINTS:
+    if not 2 <= len(rows) <= MAX_WAYPOINTS:
         raise errors.FileFormatError(
-            f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(rows)}"
+            f"{path}: expected 2 to {MAX_WAYPOINTS} waypoints, got {len(rows)}"
         )
     try:
         numbers = [[float(cell) for cell in row] for row in rows]
@@ -979,19 +1002,19 @@ def _parse_numbers(
 
 
 def _unwrap_headings(
-    path: Path, column: dict[str, assets.Doubles]
+    path: Path, column: dict[str, assets.Float64Array]
 ) -> dict[str, tuple[str, ...]]:
     """Let headings turn the shorter way, in place; return notes by column."""
     notes = dict[str, tuple[str, ...]]()
-    for name in (HEADING, TURNING):
+    for name in (HEADING_COLUMN, OBJECT_HEADING_COLUMN):
         if name in column:
-            column[name], note = the_shorter_way(column[name])
+            column[name], note = unwrap_headings(column[name])
             notes[name] = (f"{path}: {name}: {note}",) if note else ()
     return notes
 
 
 def _stack_columns(
-    column: Mapping[str, assets.Doubles], names: Sequence[str]
+    column: Mapping[str, assets.Float64Array], names: Sequence[str]
 ) -> Tensor | None:
     """Return columns of a table as a tensor (n, k), or (n,) of one; None without."""
     if names[0] not in column:

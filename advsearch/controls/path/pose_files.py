@@ -34,7 +34,7 @@ UNIT_BY_SIZE = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 POSITION = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
 # of a table of waypoints, which is none of these formats
-OWN_COLUMNS = {"time", *POSITION}
+WAYPOINT_COLUMNS = {"time", *POSITION}
 TIME_NAME = re.compile(r"(time_?)?stamp|time|t|sec(ond)?s?")
 POSITION_NAME = re.compile(
     r"(?:t|p|p_\w+_|pos(?:ition)?[._]?|translation[._]?)?([xyz])"
@@ -45,8 +45,8 @@ QUATERNION_NAME = re.compile(
 UNIT = re.compile(r"\[([^\]]*)\]")
 
 OPTICAL = "optical"
-UNUSED = "none"
-SENSOR_AXES: Mapping[str, assets.Doubles] = {
+NO_AXES = "none"
+SENSOR_AXES: Mapping[str, assets.Float64Array] = {
     OPTICAL: np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "flu": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
@@ -56,15 +56,15 @@ SENSOR_AXES: Mapping[str, assets.Doubles] = {
 """By name, what turns a camera's axes (x right, y down, z ahead) into those of the
 file's sensor.
 """
-AXES_MEAN: Mapping[str, str] = {
+AXES_DESCRIPTIONS: Mapping[str, str] = {
     OPTICAL: "x right, y down, z ahead",
     "opengl": "x right, y up, z back",
     "flu": "x ahead, y left, z up",
     "frd": "x ahead, y right, z down",
     "euroc": "x up, y right, z ahead",
-    UNUSED: "not read: the camera looks at the object",
+    NO_AXES: "not read: the camera looks at the object",
 }
-WORLD_TO_Z_UP: Mapping[str, assets.Doubles] = {
+WORLD_TO_Z_UP: Mapping[str, assets.Float64Array] = {
     "z": np.eye(3),
     "-z": np.diag([1.0, -1.0, -1.0]),
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
@@ -86,8 +86,8 @@ class Trajectory:
     """Poses from a file, as they stand in it, but for times in seconds."""
 
     format: PoseFormat
-    times: assets.Doubles | None  # (n,) seconds; None where the file has none
-    positions: assets.Doubles  # (n, 3)
+    times: assets.Float64Array | None  # (n,) seconds; None where the file has none
+    positions: assets.Float64Array  # (n, 3)
     # from the sensor's axes to the world's; None where the file has none
     rotations: Rotation | None
     notes: tuple[str, ...]
@@ -98,22 +98,22 @@ class Trajectory:
 
     def orient(
         self, axes: str, up: str, origin: Sequence[float]
-    ) -> tuple[assets.Doubles, Rotation | None]:
+    ) -> tuple[assets.Float64Array, Rotation | None]:
         """Return positions and rotations in a world whose z is up.
 
         Args:
-            axes: of the sensor, a key of `SENSOR_AXES`, or `UNUSED`.
+            axes: of the sensor, a key of `SENSOR_AXES`, or `NO_AXES`.
             up: what is up in the file's world, a key of `WORLD_TO_Z_UP`.
             origin: (3,) in the file's world.
 
         Returns:
             Positions (n, 3) from the origin; rotations from a camera's axes (x
-                right, y down, z ahead), None where the axes are `UNUSED` or the
+                right, y down, z ahead), None where the axes are `NO_AXES` or the
                 file has none.
         """
         world = Rotation.from_matrix(WORLD_TO_Z_UP[up])
         positions = world.apply(self.positions - np.asarray(origin, np.float64))
-        if axes == UNUSED or self.rotations is None:
+        if axes == NO_AXES or self.rotations is None:
             return positions, None
         return positions, world * self.rotations * Rotation.from_matrix(
             SENSOR_AXES[axes]
@@ -133,9 +133,9 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     if first is None:
         return None
     leading = [_split(line.lstrip("#").strip()) for line in lines[:first]]
-    is_waypoint_table = any(OWN_COLUMNS <= set(names) for names in leading) and not any(
-        map(_find_columns, leading)
-    )
+    is_waypoint_table = any(
+        WAYPOINT_COLUMNS <= set(names) for names in leading
+    ) and not any(map(_find_columns, leading))
     rows = [_split(line) for line in lines[first:] if not line.startswith("#")]
     headers = [names for names in leading if _find_columns(names)]
     if is_waypoint_table or (not headers and "," in lines[first] and leading):
@@ -207,19 +207,19 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
         not has_quaternion and set(QUATERNION) & set(columns)
     ):
         return {}
-    is_waypoint_table = not has_quaternion and OWN_COLUMNS <= set(names)
+    is_waypoint_table = not has_quaternion and WAYPOINT_COLUMNS <= set(names)
     return {} if is_waypoint_table else columns
 
 
 def _read_table(
     path: Path, rows: Sequence[Sequence[str]], count: int
-) -> assets.Doubles:
+) -> assets.Float64Array:
     """Return a table of numbers (rows, count). Raises FileFormatError: it is none."""
     for row in rows:
         if len(row) != count or not all(map(reading.is_number, row)):
             raise errors.FileFormatError(
                 f"{path}: expected {count} numbers in each row, got "
-                f"{reading.shown(' '.join(row))}"
+                f"{reading.format_name(' '.join(row))}"
             )
     table = np.array(rows, dtype=object).astype(np.float64)
     if not np.isfinite(table).all():
@@ -250,7 +250,7 @@ def _read_named_columns(
 
 
 def _find_time_unit(
-    path: Path, name: str, times: assets.Doubles, notes: list[str]
+    path: Path, name: str, times: assets.Float64Array, notes: list[str]
 ) -> str:
     """Return the unit of a column of times; note it where the name does not state it."""
     stated = UNIT.search(name)
@@ -259,7 +259,7 @@ def _find_time_unit(
         if unit not in UNITS:
             raise errors.FileFormatError(
                 f"{path}: expected times in {', '.join(UNITS)}, got "
-                f"{reading.shown(unit)}; correct the first line"
+                f"{reading.format_name(unit)}; correct the first line"
             )
         return unit
     for least, unit in UNIT_BY_SIZE:
@@ -272,7 +272,7 @@ def _find_time_unit(
     return "s"
 
 
-def _check_quaternions(path: Path, quaternions: assets.Doubles) -> None:
+def _check_quaternions(path: Path, quaternions: assets.Float64Array) -> None:
     """Check quaternions (n, 4). Raises FileFormatError: one is not of length 1."""
     lengths = np.linalg.norm(quaternions, axis=1)
     error = np.abs(lengths - 1.0)

@@ -47,16 +47,16 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 # degrees around the object between the camera and a projector that nobody has placed
-BESIDE = 15.0
+DEFAULT_CAMERA_ANGLE = 15.0
 # lux of a place whose brightness has no unit: a lit hall, a street at late dusk
-AMBIENT = 100.0
-LUMENS = 3000.0
-TIMES = 20.0
+DEFAULT_AMBIENT_LUX = 100.0
+DEFAULT_LUMENS = 3000.0
+MAX_AMBIENT_FACTOR = 20.0
 """Of a projector that nobody has described: it is dimmed to so many times the light of
 the place.
 """
-GREY = 0.5
-LIT_SHARE = 0.5  # of its period, in which a flashing light is on
+START_GREY = 0.5
+DUTY_CYCLE = 0.5  # of its period, in which a flashing light is on
 
 
 _lit = partial(Parameter.number, Parameter.LIT)
@@ -73,7 +73,7 @@ class ProjectorControl(PictureControl):
     _time_shift = 0.0
     kind = "projector"
     competes_with_ambient = True
-    shown = "pattern"
+    image_parameter = "pattern"
     default_epsilon = 1.0  # every picture is inside
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
@@ -92,7 +92,7 @@ class ProjectorControl(PictureControl):
             "degrees",
             -3600.0,
             3600.0,
-            f"{BESIDE:g} from the camera",
+            f"{DEFAULT_CAMERA_ANGLE:g} from the camera",
             "Direction of the projector around the object.",
             periodic=True,
         ),
@@ -119,7 +119,7 @@ class ProjectorControl(PictureControl):
             "lumens",
             0.0,
             1e6,
-            f"{LUMENS:g}, or what is {TIMES:g} times as bright as the place",
+            f"{DEFAULT_LUMENS:g}, or what is {MAX_AMBIENT_FACTOR:g} times as bright as the place",
             "Light of a white picture.",
         ),
         _lit(
@@ -127,7 +127,7 @@ class ProjectorControl(PictureControl):
             "lux",
             1e-3,
             2e5,
-            f"the place's, or {AMBIENT:g}",
+            f"the place's, or {DEFAULT_AMBIENT_LUX:g}",
             "Light on the object without the projector.",
             log=True,
         ),
@@ -200,7 +200,7 @@ class ProjectorControl(PictureControl):
             "Radius of that ball, display-referred; by default "
             "every picture is inside.",
             "epsilon",
-            most=PictureControl.LARGEST_EPSILON,
+            most=PictureControl.MAX_EPSILON,
         ),
         Choice(
             "picture",
@@ -212,7 +212,7 @@ class ProjectorControl(PictureControl):
 
     def check_choices(self) -> None:
         """Check that pattern, picture and ball go together. Raises InputError."""
-        pattern = self._given.get("pattern")
+        pattern = self._settings.get("pattern")
         picture = self.chosen["picture"]
         if (
             pattern is not None and [*pattern] != [0.0, 1.0]
@@ -230,11 +230,11 @@ class ProjectorControl(PictureControl):
             raise InputError(
                 f"{self.name}.picture: expected the path of a picture, got {picture!r}"
             )
-        self._given["picture"] = self.chosen["picture"] = str(picture)
+        self._settings["picture"] = self.chosen["picture"] = str(picture)
         conflicting = [
             setting
             for setting in ("pattern", "epsilon", "norm", "resolution", "aspect")
-            if setting in self._given
+            if setting in self._settings
         ]
         if conflicting:
             raise InputError(
@@ -258,13 +258,13 @@ class ProjectorControl(PictureControl):
         if fov is None:
             farthest = float(
                 np.linalg.norm(
-                    scene.base_vertices - geometry.middle(scene), axis=1
+                    scene.base_vertices - geometry.compute_center(scene), axis=1
                 ).max()
             )
             reach = farthest * max(1.0, columns / rows) * scene.metres
             fov = min(
                 math.degrees(
-                    2.0 * math.atan(reach / self.within(scene)._start_distance())
+                    2.0 * math.atan(reach / self.with_scene(scene)._start_distance())
                 ),
                 150.0,
             )
@@ -272,7 +272,7 @@ class ProjectorControl(PictureControl):
         if scene.environment is None or scene.environment.candelas is None:
             note = (
                 "The place's brightness has no unit: its light is taken for "
-                f"{AMBIENT:g} lux; "
+                f"{DEFAULT_AMBIENT_LUX:g} lux; "
                 f"{self.name}.ambient says otherwise."
             )
             scene = (
@@ -282,40 +282,43 @@ class ProjectorControl(PictureControl):
             )
         return scene.with_part(part)
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with its default beside the scene's camera, in its light."""
-        parameter = super().in_scene(parameter)
+        parameter = super().resolve_parameter(parameter)
         scene = self.scene
-        camera_offset = geometry.camera_to_world(scene)[:3, 3] - geometry.middle(scene)
+        camera_offset = geometry.camera_to_world(scene)[
+            :3, 3
+        ] - geometry.compute_center(scene)
         camera_distance = float(np.linalg.norm(camera_offset))
         match parameter.name:
             case "pattern":
                 return replace(
-                    parameter, default=GREY if self.chosen["start"] == "grey" else 0.0
+                    parameter,
+                    default=START_GREY if self.chosen["start"] == "grey" else 0.0,
                 )
             case "ambient":
                 candelas = (
                     None if scene.environment is None else scene.environment.candelas
                 )
                 lux = (
-                    AMBIENT
+                    DEFAULT_AMBIENT_LUX
                     if candelas is None
                     else min(max(candelas * scene.metered_irradiance, 1e-3), 2e5)
                 )
                 return replace(parameter, default=lux)
             case "lumens":
                 bright = (
-                    TIMES
-                    * float(self.resting("ambient"))
+                    MAX_AMBIENT_FACTOR
+                    * float(self.get_clean_value("ambient"))
                     * self.part.area
                     * self._start_distance() ** 2
                 )
-                return replace(parameter, default=min(LUMENS, bright))
+                return replace(parameter, default=min(DEFAULT_LUMENS, bright))
             case "azimuth":
                 return replace(
                     parameter,
                     default=math.degrees(math.atan2(camera_offset[1], camera_offset[0]))
-                    + BESIDE,
+                    + DEFAULT_CAMERA_ANGLE,
                 )
             case "elevation":
                 return replace(
@@ -343,7 +346,7 @@ class ProjectorControl(PictureControl):
         """Return how far away it stands at the start."""
         spec = self.specs.get("distance")
         return float(
-            spec.value if isinstance(spec, Fixed) else self.resting("distance")
+            spec.value if isinstance(spec, Fixed) else self.get_clean_value("distance")
         )
 
     def fit(self) -> None:
@@ -361,7 +364,7 @@ class ProjectorControl(PictureControl):
         self.flashes = (
             rate.high
             if isinstance(rate, Range)
-            else max(map(float, self.allowed("flicker", 0.0)))
+            else max(map(float, self.list_allowed_values("flicker", 0.0)))
         )
 
     def read_picture(self) -> Tensor | None:
@@ -378,15 +381,15 @@ class ProjectorControl(PictureControl):
         slot = next(one for one in self.slots if one.parameter.name == "ambient")
         return float(slot.spec.value) if isinstance(slot.spec, Fixed) else None
 
-    def in_light(self, times: float) -> Self:
+    def scale_ambient(self, factor: float) -> Self:
         if self.ambient is None:
             return self
         scaled = copy.copy(self)
-        scaled.specs = {**self.specs, "ambient": Fixed(times * self.ambient)}
+        scaled.specs = {**self.specs, "ambient": Fixed(factor * self.ambient)}
         scaled.fit()
         return scaled
 
-    def later(self, seconds: float) -> Self:
+    def advance_time(self, seconds: float) -> Self:
         shifted = copy.copy(self)
         shifted._time_shift = self._time_shift + seconds
         return shifted
@@ -397,7 +400,7 @@ class ProjectorControl(PictureControl):
         values = super().values(u)
         pattern = values["pattern"]
         # a projector gets 8 bits
-        rounded = pattern + (images.to_8_bit(pattern.detach()) - pattern.detach())
+        rounded = pattern + (images.round_to_8_bit(pattern.detach()) - pattern.detach())
         return values | {"pattern": rounded}
 
     def scene_inputs(
@@ -408,13 +411,13 @@ class ProjectorControl(PictureControl):
             float(values[name].detach())
             for name in ("azimuth", "elevation", "distance")
         )
-        pose = looking_from(self.scene, *pose_arguments).to(
+        pose = make_projector_pose(self.scene, *pose_arguments).to(
             values["distance"], copy=True
         )
-        light = self.thrown(values)
+        light = self.project_light(values)
         rate = float(values["flicker"].detach())
         phase = float(values["phase"].detach()) / 360.0
-        if rate and (rate * self._time_shift + phase) % 1.0 >= LIT_SHARE:
+        if rate and (rate * self._time_shift + phase) % 1.0 >= DUTY_CYCLE:
             light = 0.0 * light
         at_unit_distance = (
             self._relative_to_ambient(values)
@@ -423,13 +426,13 @@ class ProjectorControl(PictureControl):
         white = at_unit_distance * self.scene.metered_irradiance / math.pi
         return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
 
-    def thrown(self, values: Values) -> Tensor:
+    def project_light(self, values: Values) -> Tensor:
         """Return the picture (h, w, 3) as it is thrown, of white, linear."""
         light = (
             color.srgb_to_linear(values["pattern"]) * (1.0 - values["black"])
             + values["black"]
         )
-        return out_of_focus(light, values["blur"])
+        return blur_light(light, values["blur"])
 
     def _lux(self, values: Values) -> Tensor:
         """Return the illuminance () of a white image at the object's middle."""
@@ -461,13 +464,13 @@ class ProjectorControl(PictureControl):
         pattern = values["pattern"]
         return {
             self.name: pattern,
-            f"{self.name}-large": images.enlarged(
-                pattern, -(-images.PRINT_SIDE // len(pattern))
+            f"{self.name}-large": images.enlarge(
+                pattern, -(-images.MIN_PRINT_SIDE // len(pattern))
             ),
         }
 
 
-def out_of_focus(light: Tensor, blur: Tensor) -> Tensor:
+def blur_light(light: Tensor, blur: Tensor) -> Tensor:
     """Return a picture (h, w, 3) after a Gaussian blur of so many texels ().
 
     Outside it there is no light.
@@ -480,14 +483,16 @@ def out_of_focus(light: Tensor, blur: Tensor) -> Tensor:
         -0.5 * (torch.arange(-reach, reach + 1).to(blur) / blur.clamp_min(0.1)) ** 2
     )
     kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
-    rows = functional.conv2d(images.planes(light), kernel, padding=(0, reach), groups=3)
-    return images.picture(
+    rows = functional.conv2d(
+        images.to_planes(light), kernel, padding=(0, reach), groups=3
+    )
+    return images.to_image(
         functional.conv2d(rows, kernel.transpose(2, 3), padding=(reach, 0), groups=3)
     )
 
 
 @lru_cache(maxsize=64)
-def looking_from(
+def make_projector_pose(
     scene: SceneDescription, azimuth: float, elevation: float, distance: float
 ) -> Tensor:
     """Return a pose (4, 4) that looks at the object's middle along its own +z.
@@ -501,10 +506,10 @@ def looking_from(
         distance: as `ProjectorControl` has it.
     """
     left, up, outwards = torch.from_numpy(
-        geometry.camera_axes(azimuth, elevation, 0.0)
+        geometry.compute_camera_axes(azimuth, elevation, 0.0)
     ).float()
     position = (
-        torch.from_numpy(geometry.middle(scene)).float()
+        torch.from_numpy(geometry.compute_center(scene)).float()
         + distance / scene.metres * outwards
     )
-    return geometry.affine(torch.stack([left, up, -outwards], dim=1), position)
+    return geometry.make_affine(torch.stack([left, up, -outwards], dim=1), position)

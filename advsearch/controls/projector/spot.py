@@ -20,7 +20,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.controls.projector.projector import LUMENS, TIMES, ProjectorControl
+from advsearch.controls.projector.projector import (
+    DEFAULT_LUMENS,
+    MAX_AMBIENT_FACTOR,
+    ProjectorControl,
+)
 from advsearch.extend import (
     Choice,
     Control,
@@ -33,9 +37,9 @@ from advsearch.extend import (
     color,
 )
 
-OF_THE_SOURCE = ("azimuth", "elevation", "distance", "ambient", "flicker", "phase")
-WIDTH = 0.3  # object sizes
-WIDTH_OF_ONE = 2.0 * math.sqrt(2.0 * math.log(2.0))
+SOURCE_PARAMETERS = ("azimuth", "elevation", "distance", "ambient", "flicker", "phase")
+DEFAULT_WIDTH = 0.3  # object sizes
+WIDTH_PER_DEVIATION = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Diameter in which half of a round Gaussian of standard deviation 1 lies."""
 
 
@@ -72,7 +76,7 @@ class SpotControl(ProjectorControl):
             "object sizes",
             0.02,
             10.0,
-            WIDTH,
+            DEFAULT_WIDTH,
             "Diameter in which half of its light falls.",
             (0.05, 0.6),
             log=True,
@@ -85,12 +89,12 @@ class SpotControl(ProjectorControl):
             1e6,
             "0, or what is 20 times as bright as the place",
             "All of its light.",
-            (0.0, LUMENS),
+            (0.0, DEFAULT_LUMENS),
         ),
         *(
             parameter
             for parameter in ProjectorControl.parameters
-            if parameter.name in OF_THE_SOURCE
+            if parameter.name in SOURCE_PARAMETERS
         ),
     )
     choices = (
@@ -112,11 +116,11 @@ class SpotControl(ProjectorControl):
     # Its parameters are a few numbers, and there is no image among them: as of any
     # control.
 
-    def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
-        return Control.spec(self, parameter)
+    def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
+        return Control.get_spec(self, parameter)
 
-    def budget_of(self, parameter: Parameter) -> Any:
-        return Control.budget_of(self, parameter)
+    def get_budget(self, parameter: Parameter) -> Any:
+        return Control.get_budget(self, parameter)
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
         return Control.values(self, u)
@@ -134,23 +138,32 @@ class SpotControl(ProjectorControl):
     def check_choices(self) -> None:
         self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter; of the lumens, up to what is bright in the scene."""
         if parameter.name != "lumens":
-            return super().in_scene(parameter)
-        area = 2.0 * math.pi * (WIDTH / WIDTH_OF_ONE * self.scene.metres) ** 2
+            return super().resolve_parameter(parameter)
+        area = (
+            2.0
+            * math.pi
+            * (DEFAULT_WIDTH / WIDTH_PER_DEVIATION * self.scene.metres) ** 2
+        )
         # of a spot of the default width
-        bright = min(LUMENS, TIMES * float(self.resting("ambient")) * area)
+        bright = min(
+            DEFAULT_LUMENS,
+            MAX_AMBIENT_FACTOR * float(self.get_clean_value("ambient")) * area,
+        )
         return replace(
             parameter,
             search=(0.0, bright),
-            default=bright if self.asked and not self.searches("lumens") else 0.0,
+            default=bright
+            if self.has_requested_search and not self.is_searched("lumens")
+            else 0.0,
         )
 
-    def unchanged(self, parameter: Parameter) -> float | str:
+    def get_scene_value(self, parameter: Parameter) -> float | str:
         return 0.0  # of the lumens; see `amount`
 
-    def thrown(self, values: Values) -> Tensor:
+    def project_light(self, values: Values) -> Tensor:
         """Return the round spot (h, w, 3) as it is thrown, linear."""
         half_width = (
             math.tan(math.radians(self.part.fov) / 2.0)
@@ -162,7 +175,7 @@ class SpotControl(ProjectorControl):
             torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half_width) * half_width
             for count in (columns, rows)
         )
-        deviation = values["width"] / WIDTH_OF_ONE
+        deviation = values["width"] / WIDTH_PER_DEVIATION
         squared = (right[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
         spot = (
             torch.exp(-0.5 * squared / deviation**2)
@@ -175,7 +188,7 @@ class SpotControl(ProjectorControl):
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return how bright the brightest point of the spot is."""
-        brightest = float(self.thrown(values).detach().max())
+        brightest = float(self.project_light(values).detach().max())
         return {
             "lux": Value(
                 value=float(brightest * float(self._lux(values))),

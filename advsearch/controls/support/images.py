@@ -14,17 +14,17 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.scene.color import levels_of, linear_to_srgb, srgb_to_linear
-from advsearch.scene.color import to_8_bit as to_8_bit
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear, to_uint8
+from advsearch.scene.color import round_to_8_bit as round_to_8_bit
 from advsearch.scene.raster import Charts as Charts
 from advsearch.scene.raster import MeshSurface as MeshSurface
-from advsearch.scene.raster import pixels_in as pixels_in
-from advsearch.scene.raster import rasterised as rasterised
+from advsearch.scene.raster import rasterize_charts as rasterize_charts
+from advsearch.scene.raster import rasterize_triangles as rasterize_triangles
 
-PRINT_SIDE = 512  # least side of the picture that is kept for printing, in pixels
+MIN_PRINT_SIDE = 512  # least side of the picture that is kept for printing, in pixels
 
 
-def resampled(image: Tensor, side: int) -> Tensor:
+def resize_to_square(image: Tensor, side: int) -> Tensor:
     """Resize an (h, w, 3) image to (side, side, 3) with an antialiased bilinear filter.
 
     Values stay in [0, 1].
@@ -32,21 +32,21 @@ def resampled(image: Tensor, side: int) -> Tensor:
     return resized(image, side, side).contiguous().clamp(0.0, 1.0)
 
 
-def enlarged(pixels: Tensor, factor: int) -> Tensor:
+def enlarge(pixels: Tensor, factor: int) -> Tensor:
     """Return an image (h, w, 3) sRGB at a whole multiple of its size.
 
     It is interpolated as the renderer does it.
     """
     larger = F.interpolate(
-        planes(srgb_to_linear(pixels)),
+        to_planes(srgb_to_linear(pixels)),
         scale_factor=factor,
         mode="bilinear",
         align_corners=False,
     )
-    return linear_to_srgb(picture(larger))
+    return linear_to_srgb(to_image(larger))
 
 
-def coded(image: Tensor, quality: int) -> Tensor:
+def compress_jpeg(image: Tensor, quality: int) -> Tensor:
     """Save as a JPEG file and read it again, chroma subsampled.
 
     The derivative is that of the unchanged picture.
@@ -59,7 +59,7 @@ def coded(image: Tensor, quality: int) -> Tensor:
         image: (H, W, 3) display-referred sRGB in [0, 1].
         quality: 1 to 100, as of libjpeg.
     """
-    levels = levels_of(image.clamp(0.0, 1.0)).cpu().numpy()
+    levels = to_uint8(image.clamp(0.0, 1.0)).cpu().numpy()
     file = io.BytesIO()
     Image.fromarray(levels).save(file, "JPEG", quality=quality)
     with Image.open(file, formats=("JPEG",)) as read:
@@ -67,35 +67,35 @@ def coded(image: Tensor, quality: int) -> Tensor:
     return image + (read_back.to(image.device) - image).detach()
 
 
-def planes(image: Tensor) -> Tensor:
+def to_planes(image: Tensor) -> Tensor:
     """Reshape (H, W, C) to (1, C, H, W)."""
     return image.permute(2, 0, 1)[None]
 
 
-def picture(stack: Tensor) -> Tensor:
+def to_image(stack: Tensor) -> Tensor:
     """Reshape (1, C, H, W) to (H, W, C)."""
     return stack[0].permute(1, 2, 0)
 
 
-def warped(image: Tensor, shift: Tensor) -> Tensor:
+def warp(image: Tensor, offsets: Tensor) -> Tensor:
     """Look every pixel of an image (H, W, C) up at another position.
 
-    `shift` is (H, W, 2), pixels to the right and down; positions outside are mirrored
+    `offsets` is (H, W, 2), pixels to the right and down; positions outside are mirrored
     inwards.
     """
     height, width = image.shape[:2]
     rows, columns = torch.meshgrid(
         torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij"
     )
-    positions = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(
+    positions = torch.stack([columns, rows], dim=-1).to(image.device) + offsets.to(
         image.device
     )
     grid = (
         positions * torch.tensor([2.0 / width, 2.0 / height], device=image.device) - 1.0
     )
-    return picture(
+    return to_image(
         F.grid_sample(
-            planes(image), grid[None], padding_mode="reflection", align_corners=False
+            to_planes(image), grid[None], padding_mode="reflection", align_corners=False
         )
     )
 
@@ -108,20 +108,24 @@ def resized(
         return field
     size = (height, width)
     stack = F.interpolate(
-        planes(field), size, mode="bilinear", antialias=antialias, align_corners=False
+        to_planes(field),
+        size,
+        mode="bilinear",
+        antialias=antialias,
+        align_corners=False,
     )
-    return picture(stack).contiguous()
+    return to_image(stack).contiguous()
 
 
 @lru_cache(maxsize=8)
-def drawn(
-    height: int, width: int, seed: int, stream: str, *, normal: bool = True
+def draw_noise(
+    height: int, width: int, seed: int, stream_name: str, *, normal: bool = True
 ) -> Tensor:
     """Return the noise (height, width, 3) of a stream of random numbers.
 
     Standard normal, or uniform in [0, 1).
     """
-    generator = torch.Generator().manual_seed(seeds.stream(seed, stream))
+    generator = torch.Generator().manual_seed(seeds.stream(seed, stream_name))
     return (torch.randn if normal else torch.rand)(
         height, width, 3, generator=generator
     )

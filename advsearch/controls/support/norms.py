@@ -11,7 +11,7 @@ root-mean-square change at its edge.
 NORMS = ("linf", "l2")
 
 
-def radius(
+def compute_radius(
     norm: str, epsilon: float | None, count: int, default: float = DEFAULT_EPSILON
 ) -> float:
     """Return the radius of a ball over `count` colors.

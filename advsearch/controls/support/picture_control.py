@@ -12,18 +12,18 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import (
-    LARGEST_EPSILON,
-    NOTHING,
-    WHOLE_RANGE,
+    FULL_RANGE,
+    MAX_EPSILON,
+    NO_INPUTS,
     Budget,
     Control,
     Value,
-    changed,
+    describe_color_change,
 )
 from advsearch.controls.ranges import Fixed, Range, Spec
-from advsearch.controls.support.norms import DEFAULT_EPSILON, radius
+from advsearch.controls.support.norms import DEFAULT_EPSILON, compute_radius
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.pictures import read_picture
+from advsearch.scene.importing.pictures import read_image
 from advsearch.scene.settings import Parameter
 
 
@@ -35,8 +35,8 @@ class PictureControl(Control):
     "l2") and `epsilon`.
     """
 
-    LARGEST_EPSILON: ClassVar[float] = LARGEST_EPSILON
-    shown: ClassVar[str]  # the parameter that is the picture
+    MAX_EPSILON: ClassVar[float] = MAX_EPSILON
+    image_parameter: ClassVar[str]  # the parameter that is the picture
     # of colors, where none is chosen
     default_epsilon: ClassVar[float] = DEFAULT_EPSILON
     _picture: Tensor | None
@@ -47,45 +47,49 @@ class PictureControl(Control):
         return (int(self.chosen["resolution"]),) * 2
 
     @property
-    def free(self) -> bool:
+    def is_searched_image(self) -> bool:
         """Whether the picture is searched."""
         return self.chosen["picture"] is None and not isinstance(
-            self.specs.get(self.shown), Fixed
+            self.specs.get(self.image_parameter), Fixed
         )
 
-    def in_scene(self, parameter: Parameter) -> Parameter:
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
         return (
             replace(parameter, shape=(*self.sides, 3), default=0.0)
-            if parameter.name == self.shown
+            if parameter.name == self.image_parameter
             else parameter
         )
 
-    def spec(self, parameter: Parameter) -> Spec:
-        picture = Range(0.0, 1.0) if self.free else Fixed(0.0)
+    def get_spec(self, parameter: Parameter) -> Spec:
+        picture = Range(0.0, 1.0) if self.is_searched_image else Fixed(0.0)
         return self.specs.get(
             parameter.name,
-            picture if parameter.name == self.shown else Fixed(parameter.default),
+            picture
+            if parameter.name == self.image_parameter
+            else Fixed(parameter.default),
         )
 
-    def budget_of(self, parameter: Parameter) -> Budget:
+    def get_budget(self, parameter: Parameter) -> Budget:
         norm = self.chosen["norm"]
-        if parameter.name != self.shown or norm == "box":
-            return WHOLE_RANGE
-        spec = self.spec(parameter)
+        if parameter.name != self.image_parameter or norm == "box":
+            return FULL_RANGE
+        spec = self.get_spec(parameter)
         assert isinstance(spec, Range)
         n_colors = 3 * math.prod(self.sides)
-        reach = radius(norm, self.chosen["epsilon"], n_colors, self.default_epsilon)
+        reach = compute_radius(
+            norm, self.chosen["epsilon"], n_colors, self.default_epsilon
+        )
         return Budget(norm, reach / (spec.high - spec.low))
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
         values = super().values(u)
         picture = self._picture
         image = (
-            values[self.shown].reshape(*self.sides, 3)
+            values[self.image_parameter].reshape(*self.sides, 3)
             if picture is None
             else picture.to(u.device, copy=True)
         )
-        return values | {self.shown: image}
+        return values | {self.image_parameter: image}
 
     def read_picture(self) -> Tensor | None:
         """Return the picture (h, w, 3) sRGB that was chosen; None where none was.
@@ -95,19 +99,19 @@ class PictureControl(Control):
         if self.chosen["picture"] is None:
             return None
         try:
-            return torch.from_numpy(read_picture(Path(self.chosen["picture"])))
+            return torch.from_numpy(read_image(Path(self.chosen["picture"])))
         except FileFormatError as error:
             raise FileFormatError(f"{self.name}.picture: {error}") from error
 
     def describe(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         """Return how much a searched image changes, and the other values."""
         described = super().describe(u, so_far)
-        if not self.free:
+        if not self.is_searched_image:
             return described
         image, start_image = (
-            self.values(point)[self.shown]
+            self.values(point)[self.image_parameter]
             for point in (u.detach(), self.start.to(u.device))
         )
-        return {**changed(self.name, image - start_image), **described}
+        return {**describe_color_change(self.name, image - start_image), **described}

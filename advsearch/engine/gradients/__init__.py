@@ -1,6 +1,6 @@
 """Measure gradients of a scene, and plan how a search gets them (docs/gradients.md).
 
-    bench = gradients.Bench(renderer, loss, gradients.interior_point(renderer), seed=0,
+    bench = gradients.Bench(renderer, loss, gradients.find_interior_point(renderer), seed=0,
     spp=16) rows = list(gradients.measure_derivatives(bench, reference_spp=64,
     seeds_of_reference=(6, 16)))
 
@@ -12,7 +12,12 @@ differences of many samples, which experiments about gradients do and a search d
 from __future__ import annotations
 
 from advsearch.engine.gradients import planning
-from advsearch.engine.gradients.bench import Bench, Loss, interior_point, restrict_plan
+from advsearch.engine.gradients.bench import (
+    Bench,
+    Loss,
+    find_interior_point,
+    restrict_plan,
+)
 from advsearch.engine.gradients.derivatives import (
     FACTORS,
     Estimate,
@@ -21,19 +26,24 @@ from advsearch.engine.gradients.derivatives import (
     compare_with_reference,
     find_probes,
     list_attempts,
+    make_smooth_loss,
     measure_derivatives,
     measure_reference,
-    smooth_loss,
 )
-from advsearch.scene.formation import ITEMS
-from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, Group
+from advsearch.scene.formation import OMISSIONS
+from advsearch.scene.gradients import (
+    ADJOINT_ESTIMATORS,
+    DIFFERENCE_ESTIMATORS,
+    GradientPlan,
+    Group,
+)
 from advsearch.scene.renderer import Renderer
 
 __all__ = [
-    "BY_ADJOINT",
-    "BY_DIFFERENCES",
+    "ADJOINT_ESTIMATORS",
+    "DIFFERENCE_ESTIMATORS",
     "FACTORS",
-    "ITEMS",
+    "OMISSIONS",
     "Bench",
     "Estimate",
     "GradientPlan",
@@ -43,12 +53,12 @@ __all__ = [
     "Reference",
     "Renderer",
     "compare_with_reference",
+    "find_interior_point",
     "find_probes",
-    "interior_point",
     "list_attempts",
+    "make_smooth_loss",
     "measure_derivatives",
     "measure_reference",
     "planning",
     "restrict_plan",
-    "smooth_loss",
 ]

@@ -22,13 +22,13 @@ Loss = Callable[[Tensor], Tensor]
 
 # fraction of a full turn between the start of periodic coordinates and where gradients
 # are measured
-TURNED = 0.0317
+PERIODIC_OFFSET = 0.0317
 
 
-def interior_point(renderer: Renderer, share: float = 0.12) -> Tensor:
+def find_interior_point(renderer: Renderer, fraction: float = 0.12) -> Tensor:
     """Return the point (d,) at which gradients are measured, near the start.
 
-    Continuous coordinates with a range are at least `share` of it off its bounds.
+    Continuous coordinates with a range are at least `fraction` of it off its bounds.
     Periodic ones are turned a little: starts are often symmetric. Groups with a norm
     ball stay at their start, and so do discrete choices. But a group that starts at a
     bound with all its coordinates, as a projector's black image does, is measured in
@@ -38,13 +38,13 @@ def interior_point(renderer: Renderer, share: float = 0.12) -> Tensor:
     for group in renderer.plan.groups:
         coordinates = group.coordinates
         if group.valid and group.size <= 64 and not group.periodic:
-            u[coordinates] = u[coordinates].clamp(share, 1.0 - share)
+            u[coordinates] = u[coordinates].clamp(fraction, 1.0 - fraction)
         if group.valid and group.size > 64:
             values = u[coordinates]
             if bool(((values == 0.0) | (values == 1.0)).all()):
                 u[coordinates] = 0.5
         if group.periodic:
-            u[coordinates] = (u[coordinates] + TURNED).remainder(1.0)
+            u[coordinates] = (u[coordinates] + PERIODIC_OFFSET).remainder(1.0)
     return u
 
 
@@ -64,7 +64,7 @@ def restrict_plan(
     return replace(plan, groups=tuple(groups))
 
 
-Keep = Callable[[str, Callable[[], Any]], Any]
+StoreMeasurement = Callable[[str, Callable[[], Any]], Any]
 """From the name of a measurement, and the function that measures, to its JSON value.
 
 The value may have been stored by an earlier run.
@@ -81,7 +81,7 @@ class Bench:
         u: (d,) configuration.
         seed: root seed of the noise.
         spp: samples per pixel.
-        keep: called for each measurement, which it may store.
+        store: called for each measurement, which it may store.
         tick: called with the samples of each gradient that is computed.
     """
 
@@ -90,10 +90,10 @@ class Bench:
     u: Tensor
     seed: int
     spp: int
-    keep: Keep = lambda name, measure: measure()
+    store: StoreMeasurement = lambda name, measure: measure()
     tick: Callable[[int], object] = lambda samples: None
 
-    def gradient(self, plan: GradientPlan, seed: int) -> Tensor:
+    def compute_gradient(self, plan: GradientPlan, seed: int) -> Tensor:
         """Return one gradient (d,) by a plan, under the noise of a seed."""
         plan_before = self.renderer.plan
         self.renderer.plan = plan
@@ -103,8 +103,8 @@ class Bench:
         finally:
             self.renderer.plan = plan_before
 
-    def gradients(
-        self, plan: GradientPlan, stream: str, repeats: int, place: str | None = None
+    def compute_gradients(
+        self, plan: GradientPlan, stream: str, repeats: int, label: str | None = None
     ) -> tuple[Tensor, float]:
         """Return several gradients by a plan, and the median seconds of one.
 
@@ -112,7 +112,7 @@ class Bench:
             plan: how derivatives are computed.
             stream: of seeds; each gradient has the seed of its index.
             repeats: how many gradients.
-            place: name under which each is stored; None to store none.
+            label: name under which each is stored; None to store none.
 
         Returns:
             Gradients (repeats, d), zero where the plan has no derivative, and seconds.
@@ -125,16 +125,16 @@ class Bench:
         seconds = []
         for index in range(repeats):
             measure = partial(self._measure_gradient, plan, stream, index)
-            if place is None:
+            if label is None:
                 measurement = measure()
             else:
-                measurement = self.keep(f"{place} gradient {index}", measure)
+                measurement = self.store(f"{label} gradient {index}", measure)
             buffer = bytearray(base64.b64decode(measurement["numbers"]))
             derivatives = torch.frombuffer(buffer, dtype=torch.float32).split(sizes)
             for coordinates, values in zip(slices, derivatives, strict=True):
                 gradients[index, coordinates] = values
             seconds.append(measurement["seconds"])
-            if place is not None:
+            if label is not None:
                 self.tick(self.spp)
         return gradients, statistics.median(seconds)
 
@@ -143,7 +143,7 @@ class Bench:
     ) -> dict[str, Any]:
         """Return the derivatives of a gradient as JSON, with the seconds that it took."""
         started = time.perf_counter()
-        gradient = self.gradient(plan, seeds.stream(self.seed, stream, index))
+        gradient = self.compute_gradient(plan, seeds.stream(self.seed, stream, index))
         derivatives = torch.cat(
             [
                 gradient[group.coordinates]

@@ -19,19 +19,21 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.engine.gradients.bench import Bench, Loss, restrict_plan
 from advsearch.runs.results import GradientStatus, Measured
-from advsearch.scene.gradients import STEP_RANGE, Group, compared
+from advsearch.scene.gradients import STEP_RANGE, Group, select_compared
 
 # share of a control's largest derivative that each of its derivatives counts as, at
 # least
-SMALL = 0.1
-COORDINATEWISE = 8  # groups of at most this many coordinates are probed one by one
+MIN_SIZE_FRACTION = 0.1
+MAX_SINGLE_PROBES = 8  # groups of at most this many coordinates are probed one by one
 # relative error that the mean of an estimator may have beyond the noise
-TOLERANCE = 0.05
-LOUD = 0.2  # noise of one gradient, relative to its size, from which it is called noisy
+MAX_BIAS = 0.05
+MAX_NOISE = (
+    0.2  # noise of one gradient, relative to its size, from which it is called noisy
+)
 # standard error of a reference, relative to its size, from which on it gets no more
 # seeds
-SURE = 0.02
-CONFIDENCE = 2.5  # standard errors within which two means agree
+MAX_REFERENCE_ERROR = 0.02
+N_STANDARD_ERRORS = 2.5  # standard errors within which two means agree
 FACTORS = (1.0, 3.0, 9.0, 1.0 / 3.0)
 """Steps of differences that are tried in turn, as multiples of the plan's. A step that
 moves an outline by a pixel is as wide as a classifier's loss allows; a smooth loss
@@ -81,7 +83,7 @@ class Estimate(NamedTuple):
     factor: float = 1.0
 
 
-def smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
+def make_smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
     """Return a linear loss with smooth weights: a sum of a few waves of the picture's
     size, other in each channel.
 
@@ -121,27 +123,32 @@ def compare_with_reference(
     spp: int = 0,
 ) -> Measured:
     """Say how good an estimate is along a probe, from so many samples a pixel:
-    "reference unusable" where the reference's noise exceeds `LOUD` and doubt
-    (`CONFIDENCE` standard errors of both) covers the error; "biased" where the error of
-    the mean exceeds `TOLERANCE` beyond doubt; "noisy" where the noise exceeds `LOUD`;
+    "reference unusable" where the reference's noise exceeds `MAX_NOISE` and doubt
+    (`N_STANDARD_ERRORS` standard errors of both) covers the error; "biased" where the error of
+    the mean exceeds `MAX_BIAS` beyond doubt; "noisy" where the noise exceeds `MAX_NOISE`;
     otherwise "ok".
 
-    The size that this is relative to is the reference's, or `SMALL` of the largest of
+    The size that this is relative to is the reference's, or `MIN_SIZE_FRACTION` of the largest of
     the `others` of its control: a derivative that happens to be near zero has no size
     of its own to speak of.
     """
-    size = max([abs(reference.value), *(SMALL * abs(other.value) for other in others)])
+    size = max(
+        [
+            abs(reference.value),
+            *(MIN_SIZE_FRACTION * abs(other.value) for other in others),
+        ]
+    )
     difference = abs(estimate.value - reference.value)
-    doubt = CONFIDENCE * math.hypot(
+    doubt = N_STANDARD_ERRORS * math.hypot(
         estimate.noise / math.sqrt(max(1, estimate.repeats)), reference.noise
     )
     status: GradientStatus
-    if difference <= doubt and reference.noise > LOUD * size:
+    if difference <= doubt and reference.noise > MAX_NOISE * size:
         status = "reference unusable"
-    elif difference > TOLERANCE * size + doubt:
+    elif difference > MAX_BIAS * size + doubt:
         status = "biased"
     else:
-        status = "noisy" if estimate.noise > LOUD * size else "ok"
+        status = "noisy" if estimate.noise > MAX_NOISE * size else "ok"
 
     def relative(value: float) -> float:
         return value / size if size > 0.0 else math.inf if value else 0.0
@@ -166,7 +173,7 @@ def compare_with_reference(
     )
 
 
-def as_planned(group: Group) -> list[tuple[str, float]]:
+def list_planned(group: Group) -> list[tuple[str, float]]:
     return [(group.estimator, 1.0)]
 
 
@@ -180,9 +187,9 @@ def list_attempts(group: Group) -> list[tuple[str, float]]:
     forced = group.is_forced
     steps = {group.step}
     tries = (
-        as_planned(group)
+        list_planned(group)
         if forced
-        else [(name, 1.0) for name in compared(group.valid, group.size)]
+        else [(name, 1.0) for name in select_compared(group.valid, group.size)]
     )
     wide = [name for name in ("differences", "secant") if (name, 1.0) in tries][:1]
     for factor in FACTORS[1:]:
@@ -201,7 +208,7 @@ def find_probes(bench: Bench) -> list[Probe]:
     for group in bench.renderer.plan.groups:
         if group.estimator == "none":
             continue
-        if group.size > COORDINATEWISE:
+        if group.size > MAX_SINGLE_PROBES:
             step = group.step if group.size <= 64 else 0.03
             probes.append(
                 Probe(group, group.name, _mixed_direction(bench, group), step)
@@ -221,7 +228,7 @@ def _mixed_direction(bench: Bench, group: Group) -> Tensor:
     what the estimator leaves out shows too.
     """
     plan = restrict_plan(bench.renderer.plan, [group.name])
-    gradient = bench.gradient(plan, seeds.stream(bench.seed, "probe"))[
+    gradient = bench.compute_gradient(plan, seeds.stream(bench.seed, "probe"))[
         group.coordinates
     ]
     generator = torch.Generator().manual_seed(seeds.stream(bench.seed, "probe signs"))
@@ -246,7 +253,7 @@ def measure_reference(
     """Return the derivative along a probe by central differences at two steps, with its
     noise.
 
-    Seeds are added until the standard error is below `SURE` of the value, between the
+    Seeds are added until the standard error is below `MAX_REFERENCE_ERROR` of the value, between the
     two numbers of `repeats`. With several `factors`, each gets the smaller number of
     seeds, both steps so many times wider, until one is sure enough; if none is, the one
     with the least noise goes on.
@@ -283,12 +290,15 @@ def measure_reference(
     measured = dict[float, tuple[Reference, float]]()
     for factor in factors:
         reference, error = measured[factor] = measure(factor, repeats[0])
-        if error <= SURE * abs(reference.value):
+        if error <= MAX_REFERENCE_ERROR * abs(reference.value):
             break
     else:
         best = min(measured, key=lambda factor: measured[factor][0].noise)
         reference, error = measured[best]
-        while error > SURE * abs(reference.value) and len(pairs[best]) < repeats[1]:
+        while (
+            error > MAX_REFERENCE_ERROR * abs(reference.value)
+            and len(pairs[best]) < repeats[1]
+        ):
             reference, error = measure(best, len(pairs[best]) + 1)
     return reference
 
@@ -305,7 +315,7 @@ def _difference(bench: Bench, probe: Probe, step: float, seed: int) -> float:
     else:
         above = (bench.u + move).clamp(0.0, 1.0)
         below = (bench.u - move).clamp(0.0, 1.0)
-        if probe.group.size <= COORDINATEWISE:
+        if probe.group.size <= MAX_SINGLE_PROBES:
             width = float((above - below) @ probe.direction)
     with torch.no_grad():
         high, low = (
@@ -322,9 +332,9 @@ def measure_estimates(
     differences `factor` times as wide as planned.
     """
     names = {probe.group.name for probe in probes}
-    plan = restrict_plan(bench.renderer.plan.with_steps(factor), names, estimator)
+    plan = restrict_plan(bench.renderer.plan.scale_steps(factor), names, estimator)
     stream = estimator if factor == 1.0 else f"{estimator} x {factor:g}"
-    gradients, seconds = bench.gradients(plan, stream, repeats)
+    gradients, seconds = bench.compute_gradients(plan, stream, repeats)
     estimates = []
     for probe in probes:
         slopes = [float(gradient @ probe.direction) for gradient in gradients]
@@ -341,9 +351,9 @@ def measure_derivatives(
     bench: Bench,
     *,
     reference_spp: int,
-    seeds_of_reference: tuple[int, int],
+    reference_repeats: tuple[int, int],
     reference_factors: Sequence[float] = (1.0,),
-    tried: Callable[[Group], Sequence[tuple[str, float]]] = as_planned,
+    list_tries: Callable[[Group], Sequence[tuple[str, float]]] = list_planned,
     repeats: tuple[int, int] = (6, 8),
     stage: Callable[[str, int], None] = lambda name, steps: None,
 ) -> Iterator[Measured]:
@@ -353,7 +363,7 @@ def measure_derivatives(
     Args:
         reference_spp, seeds_of_reference, reference_factors: as `spp` of the bench, and
             as `repeats` and `factors` of `measure_reference`.
-        tried: from a group the estimators to try, by default as planned, with multiples
+        list_tries: from a group the estimators to try, by default as planned, with multiples
             of the step; a wider one on what is not `ok` yet.
         repeats: gradients by an estimator at first, and by one with another step, which
             has to be surer.
@@ -372,10 +382,10 @@ def measure_derivatives(
 
         def measure() -> dict[str, Any]:
             return measure_reference(
-                finer, probe, repeats=seeds_of_reference, factors=reference_factors
+                finer, probe, repeats=reference_repeats, factors=reference_factors
             )._asdict()
 
-        reference = Reference(**bench.keep(f"reference {probe.name}", measure))
+        reference = Reference(**bench.store(f"reference {probe.name}", measure))
         bench.tick(bench.spp)
         return reference
 
@@ -393,11 +403,11 @@ def measure_derivatives(
             )
         stage(
             f"gradients for {control}",
-            sum(len(tried(members[0].group)) for members in sets.values()),
+            sum(len(list_tries(members[0].group)) for members in sets.values()),
         )
         for members in sets.values():
             yield from _try_estimators(
-                bench, members, references, tried(members[0].group), repeats
+                bench, members, references, list_tries(members[0].group), repeats
             )
 
 
@@ -422,7 +432,7 @@ def _try_estimators(
             break
         count = repeats[0] if factor == 1.0 else repeats[1]
         name = f"{estimator} x {factor:g} {','.join(probe.name for probe in wanted)}"
-        stored = bench.keep(
+        stored = bench.store(
             name, partial(_estimates_as_json, bench, estimator, wanted, count, factor)
         )
         for probe, estimate in zip(wanted, stored, strict=True):

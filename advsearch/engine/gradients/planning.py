@@ -1,7 +1,7 @@
 """Choose how gradients are computed, by measurements on the scene.
 
 - Estimators: those with the least squared error x time.
-- Steps and sample counts: the cheapest whose gradients have a cosine of `GOAL` with the
+- Steps and sample counts: the cheapest whose gradients have a cosine of `GOAL_COSINE` with the
   converged gradient of the model's own loss (docs/gradients.md).
 - Bounces of light: as many as change the image. Paths of other lengths with one seed
   are the same, cut off earlier.
@@ -24,29 +24,31 @@ from advsearch.engine.gradients.bench import Bench, restrict_plan
 from advsearch.engine.problem import Problem
 from advsearch.runs.results import GradientStatus, Measured, PathCut, PathLength
 from advsearch.scene.gradients import (
-    BY_ADJOINT,
-    BY_DIFFERENCES,
+    ADJOINT_ESTIMATORS,
+    DIFFERENCE_ESTIMATORS,
     GradientPlan,
     Group,
-    compared,
+    select_compared,
 )
 from advsearch.scene.renderer import Renderer
 
-GOAL = 0.9  # cosine with the converged gradient that a working gradient should have
+GOAL_COSINE = (
+    0.9  # cosine with the converged gradient that a working gradient should have
+)
 FACTORS = (1.0, 3.0, 9.0)
 """Steps that are tried, as multiples of the plan's; the last only where no other will
 do: it smooths away all but the coarse shape of the loss.
 """
-COUNTS = (8, 16, 32, 64, 128)
+SAMPLE_COUNTS = (8, 16, 32, 64, 128)
 ADJOINT_RENDERS = 3.0  # renders that take about as long as an adjoint
-CONVERGED = 128
-AGAIN = 4
+CONVERGED_SPP = 128
+CONVERGED_SPP_FACTOR = 4
 """Samples a pixel of a gradient that counts as converged, and times as many where these
 do not agree, or where a working gradient has more.
 """
 # converged gradients that are taken. Two of a few numbers can agree by luck.
-WITNESSES = 3
-TELLS = 0.5
+N_CONVERGED = 3
+MIN_AGREEMENT = 0.5
 """Converged gradients of which two have a smaller cosine than this tell nothing: the
 cosine of the mean of three with the truth is then about sqrt(3 c / (1 + 2 c)) (Spearman
 and Brown), 0.87 and less. Above it the noise of the converged one, which is independent
@@ -54,20 +56,20 @@ of the working one's, only makes the measured cosine smaller: what is called `ok
 """
 
 
-def status_of(cosine: float, converged: float) -> GradientStatus:
+def rate_cosine(cosine: float, agreement: float) -> GradientStatus:
     """Return whether a cosine with the converged gradient is good enough.
 
-    It is "reference unusable" where `converged`, the smallest cosine of two converged
+    It is "reference unusable" where `agreement`, the smallest cosine of two converged
     gradients, is too small to tell.
     """
-    if not converged >= TELLS:
+    if not agreement >= MIN_AGREEMENT:
         return "reference unusable"
-    if cosine >= GOAL:
+    if cosine >= GOAL_COSINE:
         return "ok"
-    return "noisy" if converged >= GOAL else "reference unusable"
+    return "noisy" if agreement >= GOAL_COSINE else "reference unusable"
 
 
-def comparable_sets(
+def list_comparable_sets(
     groups: Iterable[Group],
 ) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
     """Return sets of groups of one control that have the same valid estimators.
@@ -78,17 +80,17 @@ def comparable_sets(
     for group in groups:
         sets.setdefault((group.control, group.valid), []).append(group)
     return [
-        (tuple(members), compared(valid, sum(group.size for group in members)))
+        (tuple(members), select_compared(valid, sum(group.size for group in members)))
         for (_, valid), members in sets.items()
     ]
 
 
-def contested(
-    plan: GradientPlan, *, every: bool = False
+def list_contested(
+    plan: GradientPlan, *, with_all: bool = False
 ) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
     """Return groups of one control with the estimators to compare on them.
 
-    There is more than one estimator, and none was forced. If `every`, these are all such
+    There is more than one estimator, and none was forced. If `with_all`, these are all such
     groups; else only those for which the interior adjoint is preferred so far: over
     poses, the model's loss is so rough that no estimator has won, and over shapes the
     material form is the quietest.
@@ -97,11 +99,11 @@ def contested(
     for group in plan.groups:
         if group.is_forced or not group.valid:
             continue
-        if every or group.valid[0] == "adjoint":
+        if with_all or group.valid[0] == "adjoint":
             open_groups.append(group)
     return [
         (groups, estimators)
-        for groups, estimators in comparable_sets(open_groups)
+        for groups, estimators in list_comparable_sets(open_groups)
         if len(estimators) > 1
     ]
 
@@ -109,16 +111,20 @@ def contested(
 REPEATS = 3  # gradients that are computed with each estimator or setting
 
 
-def plan_gradients(plan: GradientPlan, *, every: bool = False) -> int:
-    """Return how many gradients `measured_plan` computes."""
+def count_plan_gradients(plan: GradientPlan, *, with_all: bool = False) -> int:
+    """Return how many gradients `choose_estimators` computes."""
     n_estimators = sum(
-        len(estimators) for _, estimators in contested(plan, every=every)
+        len(estimators) for _, estimators in list_contested(plan, with_all=with_all)
     )
     return REPEATS * n_estimators
 
 
-def measured_plan(
-    bench: Bench, *, repeats: int = REPEATS, every: bool = False, counted: bool = False
+def choose_estimators(
+    bench: Bench,
+    *,
+    repeats: int = REPEATS,
+    with_all: bool = False,
+    count_renders: bool = False,
 ) -> GradientPlan:
     """Return the renderer's plan with every contested choice made by measurement.
 
@@ -127,16 +133,18 @@ def measured_plan(
     Args:
         bench: computes the gradients.
         repeats: gradients with each estimator.
-        every: as for `contested`.
-        counted: whether the renders that an estimator needs stand for its time
+        with_all: as for `list_contested`.
+        count_renders: whether the renders that an estimator needs stand for its time
             (`ADJOINT_RENDERS` for an adjoint), so that the choice is the same on a busy
             machine.
     """
     plan = bench.renderer.plan
-    for groups, estimators in contested(plan, every=every):
-        scores = _score_estimators(bench, plan, groups, estimators, repeats, counted)
+    for groups, estimators in list_contested(plan, with_all=with_all):
+        scores = _score_estimators(
+            bench, plan, groups, estimators, repeats, count_renders
+        )
         best = min(scores, key=lambda name: scores[name])
-        reason = _explain_scores(scores, best, bench.spp, counted)
+        reason = _explain_scores(scores, best, bench.spp, count_renders)
         group_by_name = {
             group.name: replace(group, estimator=best, reason=reason, measured=scores)
             for group in groups
@@ -168,15 +176,19 @@ def _score_estimators(
     for estimator in estimators:
         single_plan = restrict_plan(plan, group_names, estimator)
         label = f"{groups[0].name} by {estimator}"
-        gradients, seconds = bench.gradients(single_plan, "plan", repeats, label)
+        gradients, seconds = bench.compute_gradients(
+            single_plan, "plan", repeats, label
+        )
         if counted:
-            adjoint_renders = ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0
+            adjoint_renders = (
+                ADJOINT_RENDERS if estimator in ADJOINT_ESTIMATORS else 0.0
+            )
             seconds = 1.0 + single_plan.renders + adjoint_renders
         deviation = gradients - gradients.mean(dim=0)
         gradients_of[estimator] = gradients
         seconds_of[estimator] = seconds
         noise_of[estimator] = float(deviation.square().sum() / max(1, repeats - 1))
-    reference = next(name for name in estimators if name in BY_DIFFERENCES)
+    reference = next(name for name in estimators if name in DIFFERENCE_ESTIMATORS)
     reference_gradient = gradients_of[reference].mean(dim=0)
     scores = dict[str, float]()
     for estimator, gradients in gradients_of.items():
@@ -209,9 +221,13 @@ def _explain_scores(
     return reason
 
 
-def cosine_samples(plan: GradientPlan, *, counts: Sequence[int] = COUNTS) -> int:
-    """Return how many samples per pixel the gradients of `cosines` take at most, in all."""
-    each = REPEATS * sum(counts) + WITNESSES * (1 + AGAIN) * CONVERGED
+def count_cosine_samples(
+    plan: GradientPlan, *, counts: Sequence[int] = SAMPLE_COUNTS
+) -> int:
+    """Return how many samples per pixel the gradients of `measure_cosines` take at most, in all."""
+    each = (
+        REPEATS * sum(counts) + N_CONVERGED * (1 + CONVERGED_SPP_FACTOR) * CONVERGED_SPP
+    )
     return each * sum(len(factors) for _, factors in _list_controls(plan))
 
 
@@ -223,16 +239,18 @@ def _list_controls(plan: GradientPlan) -> list[tuple[list[Group], Sequence[float
             groups_of_control.setdefault(group.control, []).append(group)
     controls = list[tuple[list[Group], Sequence[float]]]()
     for groups in groups_of_control.values():
-        has_steps = any(group.estimator in BY_DIFFERENCES for group in groups)
+        has_steps = any(group.estimator in DIFFERENCE_ESTIMATORS for group in groups)
         controls.append((groups, FACTORS if has_steps else FACTORS[:1]))
     return controls
 
 
-def cosines(bench: Bench, *, counts: Sequence[int] = COUNTS) -> Iterator[Measured]:
+def measure_cosines(
+    bench: Bench, *, counts: Sequence[int] = SAMPLE_COUNTS
+) -> Iterator[Measured]:
     """Measure the cosine of working gradients with the converged one, for each control.
 
     Both have the same step. Sample counts are tried in their order until one reaches the
-    goal at a step; then the next step follows. `cosine_samples` bounds the samples of
+    goal at a step; then the next step follows. `count_cosine_samples` bounds the samples of
     all gradients.
     """
     base_plan = bench.renderer.plan
@@ -243,7 +261,7 @@ def cosines(bench: Bench, *, counts: Sequence[int] = COUNTS) -> Iterator[Measure
         for factor in factors:
             if factor == FACTORS[-1] and is_reached:
                 break
-            plan = restrict_plan(base_plan.with_steps(factor), group_names)
+            plan = restrict_plan(base_plan.scale_steps(factor), group_names)
             if plan in tried_plans:  # no step can be wider
                 continue
             tried_plans.append(plan)
@@ -263,16 +281,16 @@ def _measure_cosines(
     control = groups[0].control
     estimators = ", ".join(dict.fromkeys(group.estimator for group in groups))
     label = f"{control} x {factor:g}"
-    converged_spp = CONVERGED
+    converged_spp = CONVERGED_SPP
     converged, agreement = _converged_gradient(bench, plan, label, converged_spp)
     for spp in counts:
-        is_short = agreement < GOAL or spp > CONVERGED
-        if converged_spp == CONVERGED and is_short:
-            converged_spp = AGAIN * CONVERGED
+        is_short = agreement < GOAL_COSINE or spp > CONVERGED_SPP
+        if converged_spp == CONVERGED_SPP and is_short:
+            converged_spp = CONVERGED_SPP_FACTOR * CONVERGED_SPP
             converged, agreement = _converged_gradient(
                 bench, plan, label, converged_spp
             )
-        gradients, seconds = replace(bench, spp=spp).gradients(
+        gradients, seconds = replace(bench, spp=spp).compute_gradients(
             plan, "working", REPEATS, f"{label} {spp}"
         )
         cosine = statistics.fmean(
@@ -288,9 +306,9 @@ def _measure_cosines(
             cosine=cosine,
             reference_cosine=agreement,
             seconds=seconds,
-            status=status_of(cosine, agreement),
+            status=rate_cosine(cosine, agreement),
         )
-        if cosine >= GOAL:
+        if cosine >= GOAL_COSINE:
             break
 
 
@@ -298,8 +316,8 @@ def _converged_gradient(
     bench: Bench, plan: GradientPlan, label: str, spp: int
 ) -> tuple[Tensor, float]:
     """Return the mean (d,) of converged gradients, and the smallest cosine of two."""
-    gradients, _ = replace(bench, spp=spp).gradients(
-        plan, "converged", WITNESSES, f"{label} converged {spp}"
+    gradients, _ = replace(bench, spp=spp).compute_gradients(
+        plan, "converged", N_CONVERGED, f"{label} converged {spp}"
     )
     agreements = torch.tensor(
         [
@@ -317,7 +335,7 @@ def _cosine(first: Tensor, second: Tensor) -> float:
     return float(first @ second) / norms if norms > 0.0 else float("nan")
 
 
-def tuned(
+def choose_steps(
     plan: GradientPlan, table: Sequence[Measured]
 ) -> tuple[GradientPlan, int | None]:
     """Return the plan with each control's step chosen from measured cosines.
@@ -344,7 +362,7 @@ def tuned(
             f"cosine {cosine:.2f} with the converged gradient at {best.spp} samples "
             f"and {best.factor:g} x the step{_describe_shortfall(best)}"
         )
-        scaled_groups = plan.with_steps(best.factor).groups
+        scaled_groups = plan.scale_steps(best.factor).groups
         groups = tuple(
             replace(group, step=scaled.step, reason=f"{group.reason}; {remark}")
             if group.control == control
@@ -370,24 +388,24 @@ def _describe_shortfall(row: Measured) -> str:
     if row.status == "ok":
         return ""
     agreement = row.reference_cosine
-    if agreement is not None and agreement < TELLS:
+    if agreement is not None and agreement < MIN_AGREEMENT:
         return f": which says little, two converged ones have {agreement:.2f}"
-    return f": below {GOAL:g}, the best that was found"
+    return f": below {GOAL_COSINE:g}, the best that was found"
 
 
 # segments of the shortest path: from a lamp to a surface and on to the camera
-SHORTEST = 2
+MIN_DEPTH = 2
 # accepted root-mean-square change of the displayed image, in 8-bit levels
-BOUND = 0.5
+MAX_CHANGE = 0.5
 
 
-def measured_bounces(
+def measure_path_length(
     renderer: Renderer,
     configurations: Sequence[Tensor],
     *,
     seed: int,
     spp: int,
-    bound: float = BOUND,
+    bound: float = MAX_CHANGE,
     tick: Callable[[], None] = lambda: None,
 ) -> PathLength:
     """Measure the shortest light paths whose images agree with those of full length.
@@ -400,11 +418,11 @@ def measured_bounces(
         configurations: full configurations (d,).
         seed: of the noise.
         spp: samples per pixel.
-        bound: accepted change of the image, see `BOUND`.
+        bound: accepted change of the image, see `MAX_CHANGE`.
         tick: called after each image of a configuration.
     """
     # A denoiser would spread a change over its neighbors.
-    renderer = renderer.like(denoiser="none")
+    renderer = renderer.copy_with(denoiser="none")
     full_depth = renderer.scene.max_depth
     noise_seeds = [seeds.stream(seed, "half", half) for half in range(2)]
 
@@ -418,7 +436,7 @@ def measured_bounces(
     full_renderings = [render(u, full_depth) for u in configurations]
     cuts = []
     chosen_depth = full_depth
-    for depth in range(full_depth - 1, SHORTEST - 1, -1):
+    for depth in range(full_depth - 1, MIN_DEPTH - 1, -1):
         light = 0.0
         levels = 0.0
         for u, full in zip(configurations, full_renderings, strict=True):
@@ -449,7 +467,7 @@ def _render_with_depth(
     renderer: Renderer, u: Tensor, seed: int, spp: int, depth: int
 ) -> _Rendering:
     """Render u (d,) with light paths of at most `depth` segments."""
-    with torch.no_grad(), renderer.scene.shorter(depth):
+    with torch.no_grad(), renderer.scene.limit_depth(depth):
         radiance = renderer.radiance(u, seed, spp)
         displayed = renderer.formation.display(radiance)
         return _Rendering(radiance, renderer.space.picture(u, displayed))
@@ -482,7 +500,7 @@ def _explain_depth(cuts: Sequence[PathCut], depth: int, full_depth: int) -> str:
             texts.append(
                 f"paths of {depth} segments leave out {cut.light:.2%} of the light, "
                 "which moves the picture by "
-                f"{cut.levels:.2f} of 255 levels (bound {BOUND:g})"
+                f"{cut.levels:.2f} of 255 levels (bound {MAX_CHANGE:g})"
             )
         elif cut.depth < depth:
             texts.append(
@@ -492,33 +510,35 @@ def _explain_depth(cuts: Sequence[PathCut], depth: int, full_depth: int) -> str:
     return "; ".join(texts) or f"all {full_depth} segments"
 
 
-DRAWS = 2  # random configurations that are measured beside the clean one
+N_RANDOM_CONFIGURATIONS = (
+    2  # random configurations that are measured beside the clean one
+)
 BOUNCE_SPP = 4  # samples per pixel: the same paths are compared, so that few suffice
 # renders of a search from which on the measurement pays; each path length costs a
 # compilation
-WORTH_BOUNCES = 200
+MIN_RENDERS_FOR_BOUNCES = 200
 
 
-def most_pictures(problem: Problem) -> int:
-    """Return how many images `bounces_of` renders at most."""
-    n_depths = 1 + problem.renderer.scene.max_depth - SHORTEST
-    return (1 + DRAWS) * 2 * n_depths
+def count_bounce_images(problem: Problem) -> int:
+    """Return how many images `measure_problem_bounces` renders at most."""
+    n_depths = 1 + problem.renderer.scene.max_depth - MIN_DEPTH
+    return (1 + N_RANDOM_CONFIGURATIONS) * 2 * n_depths
 
 
-def bounces_of(
+def measure_problem_bounces(
     problem: Problem, seed: int, tick: Callable[[], None] = lambda: None
 ) -> PathLength:
     """Measure the bounces of light that a problem's search needs.
 
     It is measured on the clean configuration and random ones of its domain.
     """
-    full_configurations = [problem.whole(problem.domain.start)]
-    for index in range(DRAWS):
+    full_configurations = [problem.add_conditions(problem.domain.start)]
+    for index in range(N_RANDOM_CONFIGURATIONS):
         generator = torch.Generator().manual_seed(seeds.stream(seed, "bounces", index))
         u = problem.domain.sample(generator)[0]
         draw = seeds.stream(seed, "conditions of bounces", index)
-        full_configurations.append(problem.whole(u, draw))
-    return measured_bounces(
+        full_configurations.append(problem.add_conditions(u, draw))
+    return measure_path_length(
         problem.renderer,
         full_configurations,
         seed=seeds.stream(seed, "bounces"),

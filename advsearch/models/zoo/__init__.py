@@ -8,11 +8,13 @@ where it publishes them. They are read without unpickling.
 
 from __future__ import annotations
 
+from advsearch.models.zoo.outputs import find_timm_source as recognize_timm
 from advsearch.models.zoo.outputs import load_timm as load_timm
 from advsearch.models.zoo.outputs import load_torchvision as load_torchvision
-from advsearch.models.zoo.outputs import of_timm as recognize_timm
+from advsearch.models.zoo.transformers import (
+    find_transformers_source as recognize_transformers,
+)
 from advsearch.models.zoo.transformers import load as load_transformers
-from advsearch.models.zoo.transformers import of_network as recognize_transformers
 
 __all__ = [
     "load_timm",

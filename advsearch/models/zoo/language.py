@@ -20,8 +20,13 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.extend import InputError, errors, models
-from advsearch.models.zoo.library import Loaded, Processing, measured, nearly
-from advsearch.models.zoo.zero_shot import spoken
+from advsearch.models.zoo.library import (
+    LoadedNetwork,
+    Processing,
+    are_nearly_equal,
+    measure_processor,
+)
+from advsearch.models.zoo.zero_shot import get_spoken_names
 
 LEVELS = 0.05
 """What values of pixels may be off from the processor's for 8-bit pictures, as a share
@@ -29,12 +34,12 @@ of the largest: it rounds.
 """
 
 # Continuation by which a network that answers freely is checked.
-CHECKED = "a coffee mug"
+CHECK_TEXT = "a coffee mug"
 # Minimum number of weights for a remark on them and on the time of an answer.
-LARGE = 500_000_000
+MIN_LARGE_WEIGHTS = 500_000_000
 
 
-def speaks(architecture: str, network: Any) -> bool:
+def generates_text(architecture: str, network: Any) -> bool:
     """Whether a network of transformers, by its architecture, continues images and texts with
     text.
     """
@@ -43,7 +48,7 @@ def speaks(architecture: str, network: Any) -> bool:
     return architecture in names.values()
 
 
-def source(loaded: Loaded) -> models.Source:
+def make_language_source(loaded: LoadedNetwork) -> models.Source:
     """Return the source of a classifier of the given names, or of free answers.
 
     Raises:
@@ -52,11 +57,11 @@ def source(loaded: Loaded) -> models.Source:
         InputError: fewer than two names, or prompt and name are too long.
     """
     if getattr(loaded.network.config, "is_encoder_decoder", False):
-        raise _another(loaded, "reads from an encoder of its own")
+        raise _make_unsupported_error(loaded, "reads from an encoder of its own")
     processor = _load_processor(loaded)
     purpose = loaded.purpose
     name = loaded.name
-    is_free, question = purpose.in_words(name, "goes on in words")
+    is_free, question = purpose.parse_question(name, "goes on in words")
     names = purpose.names
     if not is_free and (names is None or len(names) < 2):
         raise InputError(
@@ -70,36 +75,36 @@ def source(loaded: Loaded) -> models.Source:
         f"model {loaded.spec}: is a {kind}, which can't be asked about "
         "a picture as LLaVA can"
     ):
-        reader = _Speaker(loaded, processor, question or models.QUESTION)
-        tokens = reader.tokens_of(names or (CHECKED,))
+        reader = _LanguageModel(loaded, processor, question or models.QUESTION)
+        tokens = reader.tokenize_names(names or (CHECK_TEXT,))
         max_new_tokens = max(purpose.tokens if is_free else 0, *map(len, tokens))
         _check_length(loaded, reader, max_new_tokens)
-        named = _Named(reader, tokens)
-        module = _Free(reader, purpose.tokens) if is_free else named
+        named = _NameClassifier(reader, tokens)
+        module = _FreeAnswerer(reader, purpose.tokens) if is_free else named
         with torch.no_grad():
-            _check(loaded, named)
+            _check_likelihood(loaded, named)
             start_time = time.perf_counter()
-            module(torch.zeros((1, 3, *reader.side)))
+            module(torch.zeros((1, 3, *reader.image_size)))
             seconds = time.perf_counter() - start_time
     if names is not None:
         _warn_of_prefixes(tokens, names, name)
     _warn_of_size(loaded, seconds)
-    return models.source_of(
+    return models.make_source(
         module,
         name,
         labels=names,
         batch_limits=(1, 1),
         reads_text=True,
-        **reader.described,
+        **reader.preprocessing,
     )
 
 
-def _load_processor(loaded: Loaded) -> Any:
+def _load_processor(loaded: LoadedNetwork) -> Any:
     """Load the processor of images and texts; the error names torchvision if it may be
     missing for it.
     """
     try:
-        return loaded.part("AutoProcessor")
+        return loaded.load_part("AutoProcessor")
     except errors.ModelError as error:
         if importlib.util.find_spec("torchvision") is None:
             raise errors.ModelError(
@@ -110,11 +115,15 @@ def _load_processor(loaded: Loaded) -> Any:
         raise
 
 
-def _check_length(loaded: Loaded, reader: _Speaker, max_new_tokens: int) -> None:
+def _check_length(
+    loaded: LoadedNetwork, reader: _LanguageModel, max_new_tokens: int
+) -> None:
     """Raise InputError if image, prompt and answer have too many tokens."""
     config = loaded.network.config.get_text_config()
     max_tokens = getattr(config, "max_position_embeddings", None)
-    n_tokens = reader.prompt(reader.side)["input_ids"].shape[1] + max_new_tokens
+    n_tokens = (
+        reader.get_prompt(reader.image_size)["input_ids"].shape[1] + max_new_tokens
+    )
     if isinstance(max_tokens, int) and n_tokens > max_tokens:
         raise InputError(
             f"prompt: expected picture, prompt and name to have at most {max_tokens} "
@@ -123,11 +132,11 @@ def _check_length(loaded: Loaded, reader: _Speaker, max_new_tokens: int) -> None
         )
 
 
-def _warn_of_size(loaded: Loaded, seconds: float) -> None:
+def _warn_of_size(loaded: LoadedNetwork, seconds: float) -> None:
     """Warn of a large network, with the seconds that an answer took."""
     weights = list(loaded.network.parameters())
     count = sum(tensor.numel() for tensor in weights)
-    if count >= LARGE:
+    if count >= MIN_LARGE_WEIGHTS:
         size = sum(tensor.nbytes for tensor in weights)
         models.warn(
             f"model {loaded.name} has {count / 1e9:.3g} billion weights, "
@@ -153,15 +162,15 @@ def _warn_of_prefixes(
 # ---- the network ----
 
 
-class _Speaker(nn.Module):
+class _LanguageModel(nn.Module):
     """A network that reads an image and a question, and continues with text.
 
-    `described` is its `Preprocessing`. A processor that is an affine map is measured and
+    `preprocessing` is its `Preprocessing`. A processor that is an affine map is measured and
     left to that; one that cuts an image into patches or tiles is called itself, which is
     differentiable with torchvision.
     """
 
-    def __init__(self, loaded: Loaded, processor: Any, question: str) -> None:
+    def __init__(self, loaded: LoadedNetwork, processor: Any, question: str) -> None:
         super().__init__()
         self.network = loaded.network
         self.processor = processor
@@ -176,17 +185,17 @@ class _Speaker(nn.Module):
             turns = [{"role": "user", "content": content}]
             self.text = processor.apply_chat_template(turns, add_generation_prompt=True)
         vision_config = getattr(loaded.network.config, "vision_config", None)
-        size = getattr(vision_config, "image_size", None) or models.SIDE
+        size = getattr(vision_config, "image_size", None) or models.DEFAULT_SIZE
         height, width = size if isinstance(size, (list, tuple)) else (size, size)
-        self.side = (int(height), int(width))
+        self.image_size = (int(height), int(width))
         processing = Processing()
         with suppress(errors.ModelError):  # it is called then
-            processing = measured(
+            processing = measure_processor(
                 lambda **options: processor(text=[self.text], **options), loaded.spec
             )
-        self.affine = "mean" in processing
-        if self.affine:
-            self.side = processing.get("input_size", self.side)
+        self.is_affine = "mean" in processing
+        if self.is_affine:
+            self.image_size = processing.get("input_size", self.image_size)
         elif importlib.util.find_spec("torchvision") is None:
             raise errors.ModelError(
                 f"model {loaded.spec}: its processor cuts pictures into patches or "
@@ -196,14 +205,14 @@ class _Speaker(nn.Module):
             )
         else:
             processing = Processing()
-        self.described = Processing(**{**processing, "input_size": self.side})
+        self.preprocessing = Processing(**{**processing, "input_size": self.image_size})
         self._check_pixels(loaded.spec)
 
     def _check_pixels(self, spec: str) -> None:
         """Raise ModelError if the processor treats a floating-point image otherwise than
         the same image in 8 bits.
         """
-        height, width = self.side
+        height, width = self.image_size
         vertical = torch.linspace(0, 200, height)[:, None]
         horizontal = torch.linspace(0, 200, width)
         # A different gradient in each channel.
@@ -215,15 +224,15 @@ class _Speaker(nn.Module):
             ]
         ).round()
         image_8bit = np.ascontiguousarray(levels.byte().permute(1, 2, 0).numpy())
-        expected = self._inputs(image_8bit)["pixel_values"]
+        expected = self._process(image_8bit)["pixel_values"]
         image = levels / 255.0
-        if self.affine:
-            mean = image.new_tensor(self.described["mean"]).view(3, 1, 1)
-            std = image.new_tensor(self.described["std"]).view(3, 1, 1)
-            if self.described["channels"] != "RGB":
+        if self.is_affine:
+            mean = image.new_tensor(self.preprocessing["mean"]).view(3, 1, 1)
+            std = image.new_tensor(self.preprocessing["std"]).view(3, 1, 1)
+            if self.preprocessing["channels"] != "RGB":
                 image = image.flip(0)
             image = (image - mean) / std
-        pixels = self._pixels(image)
+        pixels = self._compute_pixel_values(image)
         max_error = float("inf")
         if pixels.shape == expected.shape:
             max_error = float((pixels - expected).abs().max())
@@ -235,7 +244,7 @@ class _Speaker(nn.Module):
                 "and give that from Python"
             )
 
-    def _inputs(self, image: Any, text: str = "", **options: Any) -> dict[str, Tensor]:
+    def _process(self, image: Any, text: str = "", **options: Any) -> dict[str, Tensor]:
         """Return the network's inputs for an image and a text, by default the question.
 
         Inputs for training are left out.
@@ -254,13 +263,13 @@ class _Speaker(nn.Module):
             if isinstance(value, Tensor) and key != "labels"
         }
 
-    def _pixels(self, image: Tensor) -> Tensor:
+    def _compute_pixel_values(self, image: Tensor) -> Tensor:
         """Return the network's input of pixel values for an image (3, H, W)."""
-        if self.affine:
+        if self.is_affine:
             return image[None]
-        return self._inputs(image.float(), do_rescale=False)["pixel_values"]
+        return self._process(image.float(), do_rescale=False)["pixel_values"]
 
-    def tokens_of(self, names: Sequence[str]) -> list[list[int]]:
+    def tokenize_names(self, names: Sequence[str]) -> list[list[int]]:
         """Return the tokens of each name after the prompt, with a space between them unless
         there is one.
 
@@ -272,15 +281,15 @@ class _Speaker(nn.Module):
             InputError: the network has no token for a name.
         """
         tokenizer = self.processor.tokenizer
-        prompt = self.prompt(self.side)["input_ids"][0].tolist()
+        prompt = self.get_prompt(self.image_size)["input_ids"][0].tolist()
         ends_in_space = self.text[-1:].isspace()
         ends_in_special = prompt[-1] in tokenizer.all_special_ids
         gap = "" if ends_in_space or ends_in_special else " "
         text_tokens = tokenizer(self.text, verbose=False)["input_ids"]
-        words = spoken(names)
+        words = get_spoken_names(names)
         # Whether the processor adds tokens before the text only, and none behind it.
-        gray_image = np.full((*self.side, 3), 128, np.uint8)
-        inputs = self._inputs(gray_image, f"{self.text}{gap}{words[0]}")
+        gray_image = np.full((*self.image_size, 3), 128, np.uint8)
+        inputs = self._process(gray_image, f"{self.text}{gap}{words[0]}")
         starts_with_prompt = inputs["input_ids"][0].tolist()[: len(prompt)] == prompt
         tokens_of_names: list[list[int]] = []
         for word in words:
@@ -300,23 +309,25 @@ class _Speaker(nn.Module):
             tokens_of_names.append(tokens)
         return tokens_of_names
 
-    def prompt(self, side: tuple[int, int]) -> dict[str, Tensor]:
+    def get_prompt(self, image_size: tuple[int, int]) -> dict[str, Tensor]:
         """Return the network's inputs for a gray image of (height, width) pixels and the
         question.
         """
-        if side not in self._prompts:
-            self._prompts[side] = self._inputs(np.full((*side, 3), 128, np.uint8))
-        return self._prompts[side]
+        if image_size not in self._prompts:
+            self._prompts[image_size] = self._process(
+                np.full((*image_size, 3), 128, np.uint8)
+            )
+        return self._prompts[image_size]
 
-    def given(self, image: Tensor) -> dict[str, Tensor]:
+    def make_inputs(self, image: Tensor) -> dict[str, Tensor]:
         """Return the network's inputs for an image (3, H, W) and the question.
 
         Raises:
             ValueError: the processor returns another shape than for a gray image.
         """
         height, width = image.shape[1:]
-        prompt = self.prompt((height, width))
-        pixels = self._pixels(image)
+        prompt = self.get_prompt((height, width))
+        pixels = self._compute_pixel_values(image)
         if pixels.shape != prompt["pixel_values"].shape:
             expected = tuple(prompt["pixel_values"].shape)
             raise ValueError(
@@ -327,7 +338,7 @@ class _Speaker(nn.Module):
         inputs["pixel_values"] = pixels.to(weights.device, weights.dtype)
         return inputs
 
-    def begin(self, image: Tensor) -> tuple[Tensor, Any]:
+    def read_prompt(self, image: Tensor) -> tuple[Tensor, Any]:
         """Run the network on an image and the prompt.
 
         Returns:
@@ -336,13 +347,13 @@ class _Speaker(nn.Module):
         Raises:
             ValueError: the network returns no cache.
         """
-        returned = self.network(**self.given(image), use_cache=True)
+        returned = self.network(**self.make_inputs(image), use_cache=True)
         past = returned.get(self.cache)
         if past is None:
             raise ValueError("it keeps no keys and values of what it has read")
         return returned.logits[0, -1].float(), past
 
-    def go_on(self, tokens: Tensor, past: Any) -> Tensor:
+    def continue_with(self, tokens: Tensor, past: Any) -> Tensor:
         """Return the logits (N, L, tokens) float32 of the token after each of N x L tokens.
 
         `past` is the cache of one image.
@@ -354,7 +365,7 @@ class _Speaker(nn.Module):
         return logits
 
 
-class _Named(nn.Module):
+class _NameClassifier(nn.Module):
     """Compute logits (N, names): the log-likelihood of each name after image and prompt.
 
     It is summed over the tokens of the name. Image and prompt are read once. The stem of a
@@ -362,7 +373,7 @@ class _Named(nn.Module):
     with it, and all stems in one batch: names of one token need no further step.
     """
 
-    def __init__(self, reader: _Speaker, tokens: Sequence[Sequence[int]]) -> None:
+    def __init__(self, reader: _LanguageModel, tokens: Sequence[Sequence[int]]) -> None:
         super().__init__()
         self.reader = reader
         self.tokens = [list(name_tokens) for name_tokens in tokens]
@@ -383,19 +394,19 @@ class _Named(nn.Module):
         padded_stems = torch.tensor(
             [[*stem, *[0] * (stem_length - len(stem))] for stem in stems]
         ).long()
-        self._places = padded_stems, rows, columns, counts
+        self._token_tables = padded_stems, rows, columns, counts
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the log-likelihoods (N, names) for images (N, 3, H, W)."""
         stems, rows, columns, counts = (
-            tensor.to(images.device) for tensor in self._places
+            tensor.to(images.device) for tensor in self._token_tables
         )
         scores = []
         for image in images:
-            logits, past = self.reader.begin(image)
+            logits, past = self.reader.read_prompt(image)
             likelihoods = logits.log_softmax(dim=-1)[None]
             if len(stems):
-                stem_logits = self.reader.go_on(stems, past)
+                stem_logits = self.reader.continue_with(stems, past)
                 stem_likelihoods = stem_logits.log_softmax(dim=-1).flatten(0, 1)
                 likelihoods = torch.cat([likelihoods, stem_likelihoods])
             scores.append((likelihoods[rows, columns] * counts).sum(dim=1))
@@ -424,37 +435,41 @@ def _find_stems(tokens: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
     )
 
 
-class _Free(nn.Module):
-    """Answer freely about each image, `advsearch.tasks.answers.Utterance`: greedy decoding."""
+class _FreeAnswerer(nn.Module):
+    """Answer freely about each image, `advsearch.tasks.answers.AnswerWithLogits`: greedy decoding."""
 
-    def __init__(self, reader: _Speaker, most: int) -> None:
+    def __init__(self, reader: _LanguageModel, most: int) -> None:
         super().__init__()
         self.reader = reader
         self.tokenizer = reader.processor.tokenizer
-        self.most = most
+        self.max_tokens = most
         ends = reader.network.generation_config.eos_token_id
-        self.ends = frozenset(ends if isinstance(ends, (list, tuple)) else [ends]) - {
-            None
-        }
+        self.end_tokens = frozenset(
+            ends if isinstance(ends, (list, tuple)) else [ends]
+        ) - {None}
 
     def forward(self, images: Tensor) -> list[dict[str, Any]]:
         """Return the answer about each of images (N, 3, H, W)."""
         answers = []
         for image in images:
-            logits, past = self.reader.begin(image)
+            logits, past = self.reader.read_prompt(image)
             steps = [logits]
             tokens = [int(logits.argmax())]
-            while tokens[-1] not in self.ends and len(tokens) < self.most:
+            while tokens[-1] not in self.end_tokens and len(tokens) < self.max_tokens:
                 last_token = logits.new_tensor([tokens[-1:]], dtype=torch.long)
-                steps.append(self.reader.go_on(last_token, past)[0, -1])
+                steps.append(self.reader.continue_with(last_token, past)[0, -1])
                 tokens.append(int(steps[-1].argmax()))
             text = self.tokenizer.decode(tokens, skip_special_tokens=True).strip()
             answers.append(
-                {"text": text, "logits": torch.stack(steps), "begins": self.begins}
+                {
+                    "text": text,
+                    "logits": torch.stack(steps),
+                    "begins": self.find_first_tokens,
+                }
             )
         return answers
 
-    def begins(self, word: str) -> list[int]:
+    def find_first_tokens(self, word: str) -> list[int]:
         """Return the tokens that may begin a word, in lower case or capitalized, with or
         without a space before it.
         """
@@ -468,7 +483,7 @@ class _Free(nn.Module):
         return sorted(first_tokens - {self.tokenizer.unk_token_id})
 
 
-def _check(loaded: Loaded, module: _Named) -> None:
+def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
     """Compare the likelihood of the longest name with that of the network itself, read
     with the prompt at once.
 
@@ -477,8 +492,8 @@ def _check(loaded: Loaded, module: _Named) -> None:
     """
     index = max(range(len(module.tokens)), key=lambda k: len(module.tokens[k]))
     generator = torch.Generator().manual_seed(0)
-    image = torch.rand((3, *module.reader.side), generator=generator)
-    prompt = module.reader.given(image)
+    image = torch.rand((3, *module.reader.image_size), generator=generator)
+    prompt = module.reader.make_inputs(image)
     name_tokens = torch.tensor(module.tokens[index], device=loaded.network.device)
     inputs = dict(prompt)
     inputs["input_ids"] = torch.cat([prompt["input_ids"], name_tokens[None]], dim=1)
@@ -492,20 +507,22 @@ def _check(loaded: Loaded, module: _Named) -> None:
             inputs[key] = torch.cat([prompt[key], extension], dim=1)
     logits = loaded.network(**inputs).logits
     if logits.shape[1] != inputs["input_ids"].shape[1]:
-        raise _another(loaded, "returns logits of another length than the text has")
+        raise _make_unsupported_error(
+            loaded, "returns logits of another length than the text has"
+        )
     likelihoods = logits[0, -len(name_tokens) - 1 : -1].float().log_softmax(dim=-1)
     expected = likelihoods.gather(1, name_tokens[:, None]).sum().double()
     computed = module(image[None])[0, index].double()
     size = max(1.0, abs(float(expected)))
-    if not nearly(expected, computed, size, loaded.network.dtype):
-        raise _another(
+    if not are_nearly_equal(expected, computed, size, loaded.network.dtype):
+        raise _make_unsupported_error(
             loaded,
             "goes on otherwise after what it has kept "
             f"({computed:.6g} for {expected:.6g})",
         )
 
 
-def _another(loaded: Loaded, what: str) -> errors.ModelError:
+def _make_unsupported_error(loaded: LoadedNetwork, what: str) -> errors.ModelError:
     """Return the error for a network that is none of those read here."""
     return errors.ModelError(
         f"model {loaded.spec}: is a {type(loaded.network).__name__}, which {what}; "

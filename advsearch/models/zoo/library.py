@@ -26,7 +26,7 @@ from advsearch.extend import errors, models
 
 
 @contextlib.contextmanager
-def reading(spec: str, advice: str) -> Iterator[None]:
+def report_library_errors(spec: str, advice: str) -> Iterator[None]:
     """Turn what a library raises while it loads a model's weights into a ModelError.
 
     Its message has `advice` on what else the user may give. Nothing is unpickled, and
@@ -67,7 +67,7 @@ def reading(spec: str, advice: str) -> Iterator[None]:
 
 Array = npt.NDArray[np.float64]
 
-SIDES = (96, 160)  # in pixels, of the square pictures that a processor is shown
+PROBE_SIZES = (96, 160)  # in pixels, of the square pictures that a processor is shown
 # of the range of a processor's outputs: what it may be off from an affine map
 TOLERANCE = 1e-3
 # what scores that are worked out of a network's parts may be off from its own, as a
@@ -87,19 +87,19 @@ class Processing(TypedDict, total=False):
     processor: Callable[[Tensor], Tensor]
 
 
-def processor_of(transformers: Any, name: str, where: Mapping[str, Any]) -> Any:
+def load_processor(transformers: Any, name: str, where: Mapping[str, Any]) -> Any:
     """Return the image processor of a repository or a directory; None if it has none.
 
     Its own code is never run.
     """
-    if not any(cached_file(transformers, name, file, where) for file in FILES):
+    if not any(find_cached_file(transformers, name, file, where) for file in FILES):
         return None
     return transformers.AutoImageProcessor.from_pretrained(
         name, trust_remote_code=False, **where
     )
 
 
-def cached_file(
+def find_cached_file(
     transformers: Any, name: str, file: str, where: Mapping[str, Any]
 ) -> str | None:
     """Return the path of a file of a repository or a directory; None if it has none."""
@@ -109,7 +109,7 @@ def cached_file(
     return path
 
 
-def measured(processor: Any, spec: str) -> Processing:
+def measure_processor(processor: Any, spec: str) -> Processing:
     """Measure size, mean, standard deviation and channel order of a transformers
     processor.
 
@@ -123,13 +123,15 @@ def measured(processor: Any, spec: str) -> Processing:
             patches.
     """
 
-    def process_color(color: tuple[int, int, int], size: int = SIDES[0]) -> Array:
-        return _processed(processor, np.full((size, size, 3), color, np.uint8), spec)
+    def process_color(color: tuple[int, int, int], size: int = PROBE_SIZES[0]) -> Array:
+        return _run_processor(
+            processor, np.full((size, size, 3), color, np.uint8), spec
+        )
 
     black = process_color((0, 0, 0))
     processing = Processing()
     # Unless the output is just as large as the input.
-    if black.shape == process_color((0, 0, 0), SIDES[1]).shape:
+    if black.shape == process_color((0, 0, 0), PROBE_SIZES[1]).shape:
         processing["input_size"] = (black.shape[1], black.shape[2])
     offset = black.mean(axis=(1, 2))
     primaries = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
@@ -143,7 +145,7 @@ def measured(processor: Any, spec: str) -> Processing:
         expected = offset + gains.sum(axis=1) * (level / 255.0)
         difference = process_color((level, level, level)) - expected[:, None, None]
         if np.abs(difference).max() > tolerance:
-            return _called(
+            return _make_called_processing(
                 processor,
                 spec,
                 processing,
@@ -158,12 +160,12 @@ def measured(processor: Any, spec: str) -> Processing:
         ((channels, gain),) = diagonal_gains.items()
         if gain.min() > 0.0:
             return Processing(
-                mean=_triple(-offset / gain),
-                std=_triple(1.0 / gain),
+                mean=_round_triple(-offset / gain),
+                std=_round_triple(1.0 / gain),
                 channels=channels,
                 **processing,
             )
-    return _called(
+    return _make_called_processing(
         processor,
         spec,
         processing,
@@ -171,13 +173,13 @@ def measured(processor: Any, spec: str) -> Processing:
     )
 
 
-def _processed(processor: Any, picture: Any, spec: str) -> Array:
+def _run_processor(processor: Any, picture: Any, spec: str) -> Array:
     """Run a processor on an 8-bit image (H, W, 3), and return its output (3, h, w)."""
     values: Array = np.asarray(
         processor(images=picture, return_tensors="np")["pixel_values"], np.float64
     )
     if values.ndim != 4 or values.shape[:2] != (1, 3):
-        raise _other(
+        raise _make_processor_error(
             spec,
             processor,
             f"returns an array of shape {values.shape} in place of (1, 3, H, W)",
@@ -186,7 +188,9 @@ def _processed(processor: Any, picture: Any, spec: str) -> Array:
     return picked
 
 
-def _called(processor: Any, spec: str, processing: Processing, what: str) -> Processing:
+def _make_called_processing(
+    processor: Any, spec: str, processing: Processing, what: str
+) -> Processing:
     """Return the measured size, with the processor to be called on images of it.
 
     Args:
@@ -198,14 +202,14 @@ def _called(processor: Any, spec: str, processing: Processing, what: str) -> Pro
     Raises:
         ModelError: it ignores pixels, or no gradient goes through it.
     """
-    height, width = processing.get("input_size", (SIDES[0], SIDES[0]))
+    height, width = processing.get("input_size", (PROBE_SIZES[0], PROBE_SIZES[0]))
     _check_reads_all_pixels(processor, spec)
     levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
     # An image of the right size is neither resized nor cropped.
     switches = ("do_resize", "do_center_crop")
     off = {name: False for name in switches if getattr(processor, name, None)}
     process = partial(processor, **off)
-    expected = _processed(process, levels, spec)
+    expected = _run_processor(process, levels, spec)
     image = torch.from_numpy(levels).float() / 255.0
     images = image.movedim(2, 0)[None].requires_grad_()
 
@@ -226,7 +230,7 @@ def _called(processor: Any, spec: str, processing: Processing, what: str) -> Pro
         advice = ""
         if getattr(processor, "backend", None) == "pil":
             advice = "; with torchvision installed, transformers takes one that may"
-        raise _other(
+        raise _make_processor_error(
             spec,
             processor,
             f"{what}, and lets no gradient through "
@@ -236,7 +240,7 @@ def _called(processor: Any, spec: str, processing: Processing, what: str) -> Pro
     if output.shape == (1, *expected.shape):
         error_size = np.abs(output.detach().double().numpy() - expected).max()
     if not has_gradient or not error_size <= TOLERANCE * np.ptp(expected):
-        raise _other(
+        raise _make_processor_error(
             spec,
             processor,
             f"{what}, and rounds or does otherwise where a gradient goes through it",
@@ -247,22 +251,26 @@ def _called(processor: Any, spec: str, processing: Processing, what: str) -> Pro
 def _check_reads_all_pixels(processor: Any, spec: str) -> None:
     """Raise ModelError if a pixel of the output is the same for black and white."""
     black, white = (
-        _processed(processor, np.full((SIDES[0], SIDES[0], 3), level, np.uint8), spec)
+        _run_processor(
+            processor,
+            np.full((PROBE_SIZES[0], PROBE_SIZES[0], 3), level, np.uint8),
+            spec,
+        )
         for level in (0, 255)
     )
     if (black == white).all(axis=0).any():
-        raise _other(
+        raise _make_processor_error(
             spec, processor, "pads a square picture, or leaves some of its pixels out"
         )
 
 
-def _triple(numbers: Array) -> models.Triple:
+def _round_triple(numbers: Array) -> models.Triple:
     """Round to what eight digits hold: a processor computes in float32."""
     red, green, blue = (float(f"{number:.7g}") + 0.0 for number in numbers)
     return red, green, blue
 
 
-def _other(spec: str, processor: Any, what: str) -> errors.ModelError:
+def _make_processor_error(spec: str, processor: Any, what: str) -> errors.ModelError:
     return errors.ModelError(
         f"model {spec}: its processor {type(processor).__name__} {what}, which no "
         "size, mean and std stand for. Wrap "
@@ -271,16 +279,20 @@ def _other(spec: str, processor: Any, what: str) -> errors.ModelError:
     )
 
 
-Ask = Callable[[Any, Tensor], Any]  # what asks a network about pictures (N, 3, H, W)
+RunNetwork = Callable[
+    [Any, Tensor], Any
+]  # what asks a network about pictures (N, 3, H, W)
 
 
-class Adapted(nn.Module):
+class AdaptedNetwork(nn.Module):
     """A network of a library, called as that library calls it.
 
     `boxes` states that its boxes are corners in pixels.
     """
 
-    def __init__(self, network: nn.Module, ask: Ask, *, boxes: bool = False) -> None:
+    def __init__(
+        self, network: nn.Module, ask: RunNetwork, *, boxes: bool = False
+    ) -> None:
         super().__init__()
         self.network = network
         self.ask = ask
@@ -291,7 +303,7 @@ class Adapted(nn.Module):
 
 
 @dataclass(frozen=True, eq=False)
-class Loaded:
+class LoadedNetwork:
     """A network of transformers, with what belongs to it.
 
     Attributes:
@@ -299,7 +311,7 @@ class Loaded:
         name: of the model.
         spec: what the user wrote, for messages.
         processor: of images; None if it has none.
-        part: loads another part by its class, such as "AutoTokenizer".
+        load_part: loads another part by its class, such as "AutoTokenizer".
         purpose: of the network.
     """
 
@@ -308,12 +320,12 @@ class Loaded:
     spec: str  # what its user wrote, for messages
     processor: Any  # of images; None where it has none
     # loads another part by the class that does it, such as "AutoTokenizer"
-    part: Callable[[str], Any]
+    load_part: Callable[[str], Any]
     purpose: models.Purpose
 
     @cached_property
-    def described(self) -> Processing:
-        """The preprocessing of images. Raises ModelError as `measured`; warns if there is no image
+    def preprocessing(self) -> Processing:
+        """The preprocessing of images. Raises ModelError as `measure_processor`; warns if there is no image
         processor.
         """
         if self.processor is None:
@@ -324,16 +336,16 @@ class Loaded:
                 "otherwise"
             )
             return Processing()
-        return measured(self.processor, self.spec)
+        return measure_processor(self.processor, self.spec)
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def class_names(self) -> tuple[str, ...]:
         """The names of its classes in its ``config``; none if transformers only numbers them."""
         labels = getattr(self.network.config, "id2label", None) or {}
         names = tuple(str(labels[key]) for key in sorted(labels, key=int))
         return () if all(re.fullmatch(r"LABEL_\d+", name) for name in names) else names
 
-    def sized(self, config: Any) -> Processing:
+    def get_sized_preprocessing(self, config: Any) -> Processing:
         """Return the preprocessing, with the size in a part of the network's ``config`` if
         it has none.
         """
@@ -342,36 +354,43 @@ class Loaded:
         processing = Processing()
         if input_size:
             processing["input_size"] = input_size
-        return Processing(**{**processing, **self.described})
+        return Processing(**{**processing, **self.preprocessing})
 
-    def source(self, ask: Ask, *, boxes: bool = False, **fields: Any) -> models.Source:
-        """Return the source of the network as `Adapted` calls it; `fields` go to `Source`."""
-        return models.source_of(
-            Adapted(self.network, ask, boxes=boxes),
+    def make_source(
+        self, ask: RunNetwork, *, boxes: bool = False, **fields: Any
+    ) -> models.Source:
+        """Return the source of the network as `AdaptedNetwork` calls it; `fields` go to `Source`."""
+        return models.make_source(
+            AdaptedNetwork(self.network, ask, boxes=boxes),
             self.name,
-            **{**self.described, **fields},
+            **{**self.preprocessing, **fields},
         )
 
-    def with_texts(
+    def make_text_source(
         self, module: nn.Module, names: tuple[str, ...], dtype: torch.dtype
     ) -> models.Source:
         """Return the source of a module made of the network and texts for names."""
-        described = self.sized(getattr(self.network.config, "vision_config", None))
-        return models.source_of(
+        described = self.get_sized_preprocessing(
+            getattr(self.network.config, "vision_config", None)
+        )
+        return models.make_source(
             module, self.name, labels=names, dtype=dtype, reads_text=True, **described
         )
 
 
-def nearly(own: Tensor, ours: Tensor, size: float, dtype: torch.dtype) -> bool:
+def are_nearly_equal(
+    expected: Tensor, computed: Tensor, size: float, dtype: torch.dtype
+) -> bool:
     """Whether a network's own scores and those that we compute from its parts are equal up to
     rounding in its dtype, relative to a size.
     """
     return bool(
-        (own - ours).abs().max() <= max(ROUNDING, 8.0 * torch.finfo(dtype).eps) * size
+        (expected - computed).abs().max()
+        <= max(ROUNDING, 8.0 * torch.finfo(dtype).eps) * size
     )
 
 
-def in_pixels(boxes: Tensor, images: Tensor) -> Tensor:
+def to_pixel_corners(boxes: Tensor, images: Tensor) -> Tensor:
     """Convert boxes (N, K, 4), center and size as fractions of images (N, 3, H, W), to corners
     x0, y0, x1, y1 in pixels.
     """

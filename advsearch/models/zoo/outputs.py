@@ -21,12 +21,16 @@ from torch.nn import functional
 
 from advsearch.extend import InputError, errors, models
 from advsearch.models.zoo import zero_shot
-from advsearch.models.zoo.library import Adapted, Loaded, reading
+from advsearch.models.zoo.library import (
+    AdaptedNetwork,
+    LoadedNetwork,
+    report_library_errors,
+)
 
 TASK = "similarity"  # the task that compares features
 ENDINGS = ("Model", "ModelWithProjection")
 # Names of the weights of a first token that stands for the full image.
-TOKENS = ("cls_token", "class_embedding", "class_token")
+CLASS_TOKEN_NAMES = ("cls_token", "class_embedding", "class_token")
 
 
 def gives_features(architecture: str, network: Any) -> bool:
@@ -38,7 +42,7 @@ def gives_features(architecture: str, network: Any) -> bool:
     if (
         network is None
         or not architecture.endswith(ENDINGS)
-        or zero_shot.compares(network)
+        or zero_shot.encodes_images_and_texts(network)
     ):
         return False
     finds = (
@@ -48,7 +52,7 @@ def gives_features(architecture: str, network: Any) -> bool:
     return getattr(network, "main_input_name", None) == "pixel_values" and not finds
 
 
-def no_classes(name: str, what: str) -> errors.ModelError:
+def make_no_classes_error(name: str, what: str) -> errors.ModelError:
     """Return the error for a classifier that has features only; `what` it is: "is a
     Dinov2Model".
     """
@@ -59,8 +63,8 @@ def no_classes(name: str, what: str) -> errors.ModelError:
     )
 
 
-def source(
-    loaded: Loaded, plain: Callable[[Loaded], models.Source] | None = None
+def make_feature_source(
+    loaded: LoadedNetwork, plain: Callable[[LoadedNetwork], models.Source] | None = None
 ) -> models.Source:
     """Return the source of a network that has features.
 
@@ -74,7 +78,7 @@ def source(
     network = loaded.network
     if loaded.purpose.task != TASK:
         if plain is None:
-            raise no_classes(loaded.name, f"is a {type(network).__name__}")
+            raise make_no_classes_error(loaded.name, f"is a {type(network).__name__}")
         return plain(loaded)
     if loaded.purpose.prompts is not None:
         raise InputError(
@@ -83,7 +87,7 @@ def source(
         )
     backbone = network
     config = network.config
-    if zero_shot.compares(network):
+    if zero_shot.encodes_images_and_texts(network):
         zero_shot.check_takes_pictures(network, loaded.spec)
         config = getattr(config, "vision_config", config)
     elif "ForImageClassification" in type(network).__name__:
@@ -96,18 +100,22 @@ def source(
                 "head; give its network without one"
             )
     has_class_token = any(
-        word in name for name, _ in backbone.named_parameters() for word in TOKENS
+        word in name
+        for name, _ in backbone.named_parameters()
+        for word in CLASS_TOKEN_NAMES
     )
 
     def compute_features(network: Any, images: Tensor) -> Any:
-        compares = zero_shot.compares(network)
+        compares = zero_shot.encodes_images_and_texts(network)
         encode = network.get_image_features if compares else network
         returned = encode(pixel_values=images)
         features = models.pooled(returned, token=has_class_token)
         return returned if features is None else features
 
     loaded = replace(loaded, network=backbone)
-    return loaded.source(compute_features, **loaded.sized(config))
+    return loaded.make_source(
+        compute_features, **loaded.get_sized_preprocessing(config)
+    )
 
 
 DISPARITY = "relative disparity"
@@ -125,7 +133,7 @@ published weights.
 """
 
 
-def depth_source(loaded: Loaded) -> models.Source:
+def make_depth_source(loaded: LoadedNetwork) -> models.Source:
     """Return the source of a network that predicts depth: a mapping with values
     (N, h, w) under their kind.
     """
@@ -153,7 +161,7 @@ def depth_source(loaded: Loaded) -> models.Source:
         depth = functional.interpolate(depth, size=padded.shape[2:], mode="bicubic")
         return {kind: depth[:, 0, top : top + height, left : left + width]}
 
-    return loaded.source(ask)
+    return loaded.make_source(ask)
 
 
 MASKS = (
@@ -163,11 +171,11 @@ MASKS = (
 """Pattern of architectures that return masks and their classes."""
 
 # Size to which transformers resizes the masks of every Mask2Former before their sum.
-FINE = (384, 384)
+MASK_SIZE = (384, 384)
 SENTENCE = "the task is semantic"  # the text input of OneFormer
 
 
-def mask_source(loaded: Loaded) -> models.Source:
+def make_mask_source(loaded: LoadedNetwork) -> models.Source:
     """Return the source of a network that returns masks and their classes.
 
     Its output is the logarithms of scores (N, classes, H, W) of each pixel of the input. The
@@ -193,7 +201,9 @@ def mask_source(loaded: Loaded) -> models.Source:
             "max_length": config.task_seq_len,
             "truncation": True,
         }
-        tokens = loaded.part("AutoTokenizer")([SENTENCE], return_tensors="pt", **fill)
+        tokens = loaded.load_part("AutoTokenizer")(
+            [SENTENCE], return_tensors="pt", **fill
+        )
         sentence = torch.as_tensor(tokens["input_ids"] * tokens["attention_mask"])
 
     def ask(network: Any, images: Tensor) -> Tensor:
@@ -207,14 +217,14 @@ def mask_source(loaded: Loaded) -> models.Source:
         masks = returned.masks_queries_logits
         classes = returned.class_queries_logits.softmax(dim=-1)[..., :-1]
         if family == "mask2former":
-            masks = functional.interpolate(masks, size=FINE, mode="bilinear")
+            masks = functional.interpolate(masks, size=MASK_SIZE, mode="bilinear")
         elif family.startswith("eomt"):
             masks = functional.interpolate(masks, size=size, mode="bilinear")
         scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
         scores = functional.interpolate(scores, size=size, mode="bilinear")
-        return scores.float().clamp_min(models.SMALLEST_PROBABILITY).log()
+        return scores.float().clamp_min(models.MIN_PROBABILITY).log()
 
-    return loaded.source(ask, labels=loaded.names or None)
+    return loaded.make_source(ask, labels=loaded.class_names or None)
 
 
 # ---- ``timm:NAME`` and ``torchvision:NAME`` ----
@@ -231,19 +241,19 @@ def load_timm(spec: str, purpose: models.Purpose) -> models.Source:
         UnknownNameError: timm has no network of that name.
     """
     name, weights = models.split_weights(spec.partition(":")[2])
-    timm = models.library("timm", spec, "timm")
+    timm = models.import_library("timm", spec, "timm")
     if not timm.is_model(name.partition(".")[0]):
         raise errors.UnknownNameError(
-            "timm network", name, models.near_names(name, timm.list_models())
+            "timm network", name, models.find_near_names(name, timm.list_models())
         )
-    with reading(spec, f"Give 'timm:{name}@weights.safetensors'"):
+    with report_library_errors(spec, f"Give 'timm:{name}@weights.safetensors'"):
         module = timm.create_model(name, pretrained=weights is None)
     if weights is not None:
         models.load_weights(module, weights, name)
-    return _source(timm, module, name, purpose)
+    return _make_timm_source(timm, module, name, purpose)
 
 
-def timm_repository(
+def load_timm_repository(
     spec: str, name: str, revision: str, purpose: models.Purpose
 ) -> models.Source:
     """Load the network of a repository, or of a directory, that timm has saved.
@@ -252,41 +262,48 @@ def timm_repository(
         ModelError: timm is missing, or the network cannot be loaded; `spec` is for
             messages.
     """
-    timm = models.library("timm", spec, "timm")
+    timm = models.import_library("timm", spec, "timm")
     if Path(name).is_dir():
         location = f"local-dir:{name}"
     else:
         location = f"hf-hub:{name}{'@' if revision else ''}{revision}"
-    with reading(
+    with report_library_errors(
         spec, "Give a folder with config.json and model.safetensors, as timm saves them"
     ):
         module = timm.create_model(location, pretrained=True)
-    return _source(timm, module, name.rstrip("/").rpartition("/")[2], purpose)
+    return _make_timm_source(timm, module, name.rstrip("/").rpartition("/")[2], purpose)
 
 
-def of_timm(network: nn.Module, purpose: models.Purpose) -> models.Source | None:
+def find_timm_source(
+    network: nn.Module, purpose: models.Purpose
+) -> models.Source | None:
     """Return the source of an existing network of timm; None for any other network."""
     timm: Any = sys.modules.get("timm")
     if timm is None or not isinstance(getattr(network, "pretrained_cfg", None), dict):
         return None
-    return _source(timm, network, type(network).__name__, purpose)
+    return _make_timm_source(timm, network, type(network).__name__, purpose)
 
 
-def wrapped_timm(loaded: Loaded) -> models.Source:
+def make_wrapped_timm_source(loaded: LoadedNetwork) -> models.Source:
     """Return the source of a network of timm inside a `TimmWrapperForImageClassification` of
     transformers, whose ``config`` may have more than timm.
 
     There are no labels if transformers only numbers them.
     """
-    timm = models.library("timm", loaded.spec, "timm")
+    timm = models.import_library("timm", loaded.spec, "timm")
     network: Any = loaded.network
     described = getattr(network.config, "pretrained_cfg", None)
-    return _source(
-        timm, network.timm_model, loaded.name, loaded.purpose, described, loaded.names
+    return _make_timm_source(
+        timm,
+        network.timm_model,
+        loaded.name,
+        loaded.purpose,
+        described,
+        loaded.class_names,
     )
 
 
-def _source(
+def _make_timm_source(
     timm: Any,
     module: Any,
     name: str,
@@ -307,7 +324,9 @@ def _source(
     needs_features = purpose.task == TASK
     n_classes = module.num_classes
     if n_classes == 0 and not needs_features:
-        raise no_classes(name, "is a network without a head (num_classes is 0)")
+        raise make_no_classes_error(
+            name, "is a network without a head (num_classes is 0)"
+        )
     options = {"pretrained_cfg": dict(described)} if described else {}
     config = timm.data.resolve_model_data_config(module, **options)
     names = labels or module.pretrained_cfg.get("label_names")
@@ -321,8 +340,10 @@ def _source(
         return network.forward_head(network.forward_features(images), pre_logits=True)
 
     has_head = bool(n_classes)
-    return models.source_of(
-        Adapted(module, compute_features) if needs_features and has_head else module,
+    return models.make_source(
+        AdaptedNetwork(module, compute_features)
+        if needs_features and has_head
+        else module,
         name,
         input_size=tuple(map(int, config["input_size"][1:])),
         mean=tuple(map(float, config["mean"])),
@@ -331,7 +352,7 @@ def _source(
     )
 
 
-MOST_DETECTED = 4
+MAX_DETECTOR_BATCH = 4
 """Maximum batch size of a detector: at 800 x 800 each image takes a gigabyte or two with
 its derivative.
 """
@@ -351,7 +372,7 @@ def load_torchvision(spec: str) -> models.Source:
         UnknownNameError: torchvision has no such network.
     """
     name, weights = models.split_weights(spec.partition(":")[2])
-    zoo = models.library("torchvision", spec, "torchvision").models
+    zoo = models.import_library("torchvision", spec, "torchvision").models
     classifiers = zoo.list_models(module=zoo)
     segmenters = zoo.list_models(module=zoo.segmentation)
     detectors = zoo.list_models(module=zoo.detection)
@@ -359,22 +380,24 @@ def load_torchvision(spec: str) -> models.Source:
     if name not in known_names:
         _check_reads_images(zoo, name, spec)
         raise errors.UnknownNameError(
-            "torchvision network", name, models.near_names(name, known_names)
+            "torchvision network", name, models.find_near_names(name, known_names)
         )
     default = getattr(zoo.get_model_weights(name), "DEFAULT", None)
     options = {} if name in classifiers else {"weights_backbone": None}
-    with reading(spec, f"Give 'torchvision:{name}@weights.safetensors'"):
+    with report_library_errors(spec, f"Give 'torchvision:{name}@weights.safetensors'"):
         module: nn.Module = zoo.get_model(
             name, weights=None if weights else default, **options
         )
     if weights is not None:
         models.load_weights(module, weights, name)
     if name in classifiers:
-        return models.source_of(module, name, **_defaults(default, module))
-    fields = _defaults(default, None)
+        return models.make_source(module, name, **_get_default_fields(default, module))
+    fields = _get_default_fields(default, None)
     if name in segmenters:
-        return models.source_of(Adapted(module, _scores_by_pixel), name, **fields)
-    fields |= {"mean": None, "std": None, "batch_limits": (1, MOST_DETECTED)}
+        return models.make_source(
+            AdaptedNetwork(module, _run_segmenter), name, **fields
+        )
+    fields |= {"mean": None, "std": None, "batch_limits": (1, MAX_DETECTOR_BATCH)}
     # The transform would resize a square image.
     transform = getattr(module, "transform", None)
     fixed_size = getattr(transform, "fixed_size", None)
@@ -384,7 +407,9 @@ def load_torchvision(spec: str) -> models.Source:
     elif min_size:
         size = int(min_size if isinstance(min_size, int) else min_size[-1])
         fields["input_size"] = (size, size)
-    return models.source_of(Adapted(module, _detections, boxes=True), name, **fields)
+    return models.make_source(
+        AdaptedNetwork(module, _run_detector, boxes=True), name, **fields
+    )
 
 
 def _check_reads_images(zoo: Any, name: str, spec: str) -> None:
@@ -410,17 +435,19 @@ NOT_FOR_PICTURES = {
 """What torchvision's other networks are, by its module, and what to do about them."""
 
 
-def _detections(network: Any, images: Tensor) -> Any:
+def _run_detector(network: Any, images: Tensor) -> Any:
     """Return the detections of each image (N, 3, H, W)."""
     return network(list(images))
 
 
-def _scores_by_pixel(network: Any, images: Tensor) -> Any:
+def _run_segmenter(network: Any, images: Tensor) -> Any:
     """Return the logits (N, classes, H, W) of a segmenter."""
     return network(images)["out"]
 
 
-def _defaults(default: Any | None, classifier: nn.Module | None) -> dict[str, Any]:
+def _get_default_fields(
+    default: Any | None, classifier: nn.Module | None
+) -> dict[str, Any]:
     """Return the fields of a source that default weights state.
 
     Args:

@@ -21,30 +21,30 @@ from torch.nn.functional import interpolate
 from advsearch.extend import errors, models
 from advsearch.models.zoo import language, outputs, zero_shot
 from advsearch.models.zoo.library import (
-    Adapted,
-    Ask,
-    Loaded,
-    cached_file,
-    in_pixels,
-    processor_of,
-    reading,
+    AdaptedNetwork,
+    LoadedNetwork,
+    RunNetwork,
+    find_cached_file,
+    load_processor,
+    report_library_errors,
+    to_pixel_corners,
 )
 
 
 class Family(NamedTuple):
-    """Networks of transformers that are loaded and asked alike: `ours` tells them, a
+    """Networks of transformers that are loaded and asked alike: `matches` tells them, a
     pattern in the name of an architecture (``DeiTForImageClassificationWithTeacher``),
     or a function of that and the network or its class. The class of transformers that
-    builds them is AutoModel and `loader`, or for None the architecture itself; `source`
+    builds them is AutoModel and `loader`, or for None the architecture itself; `make_zero_shot_source`
     makes the model's source.
     """
 
-    ours: str | Callable[[str, Any], bool]
+    matches: str | Callable[[str, Any], bool]
     loader: str | None
-    source: Callable[[Loaded], models.Source]
+    source: Callable[[LoadedNetwork], models.Source]
 
 
-PATIENCE = 5.0
+HUB_TIMEOUT = 5.0
 """Timeout in seconds of the hub's first response. Its client would retry each file for
 half a minute.
 """
@@ -61,7 +61,7 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
 
     One that reads texts gets its classes from the user (`zero_shot`, `language`). Labels of
     others are those that they were published with; size, channel order and normalization
-    are measured on the image processor (`library.measured`); a ModelWarning reports if there
+    are measured on the image processor (`import_library.measured`); a ModelWarning reports if there
     is none. Code in a repository is never run, and weights are read from safetensors alone.
     A repository that timm has saved goes to timm.
 
@@ -71,7 +71,7 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
             processor does what `Preprocessing` cannot.
     """
     name, _, revision = spec.partition(":")[2].strip().partition("@")
-    transformers = models.library("transformers", spec, "hf")
+    transformers = models.import_library("transformers", spec, "hf")
     if Path(name).is_dir():
         name = str(Path(name).resolve())
     elif Path(name).is_file():
@@ -81,24 +81,26 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
         )
     elif name.startswith((".", "/", "~")) or name.count("/") > 1:
         raise errors.ModelError(
-            f"model {spec}: no such folder{_near_folders(name)}; a repository is "
+            f"model {spec}: no such folder{_suggest_folders(name)}; a repository is "
             "written hf:OWNER/NAME"
         )
     if not sys.stderr.isatty():
         transformers.utils.logging.disable_progress_bar()
     where: dict[str, Any] = {"revision": revision} if revision else {}
-    with reading(spec, ADVICE):
-        if not Path(name).is_dir() and _out_of_reach(name):
+    with report_library_errors(spec, ADVICE):
+        if not Path(name).is_dir() and _is_hub_unreachable(name):
             where["local_files_only"] = True
-        saved = _config(transformers, name, spec, where)
+        saved = _load_config(transformers, name, spec, where)
         # which timm itself has saved
         if saved.get("model_type") == "timm_wrapper" and "architectures" not in saved:
-            return outputs.timm_repository(spec, name, revision, purpose)
+            return outputs.load_timm_repository(spec, name, revision, purpose)
         config = transformers.AutoConfig.from_pretrained(
             name, trust_remote_code=False, **where
         )
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
-        kind = _kind(architecture, getattr(transformers, architecture, None), spec)
+        kind = _find_family(
+            architecture, getattr(transformers, architecture, None), spec
+        )
         check_fits(transformers, name, where, spec)
         builder = architecture if kind.loader is None else f"AutoModel{kind.loader}"
         network, report = getattr(transformers, builder).from_pretrained(
@@ -108,17 +110,19 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
             output_loading_info=True,
             **where,
         )
-        _check_whole(network, report, spec)
-        processor = processor_of(transformers, name, where)
-    part = partial(_part, transformers, spec, name, where)
+        _check_weights(network, report, spec)
+        processor = load_processor(transformers, name, where)
+    part = partial(_load_part, transformers, spec, name, where)
     return kind.source(
-        Loaded(
+        LoadedNetwork(
             network, name.rstrip("/").rpartition("/")[2], spec, processor, part, purpose
         )
     )
 
 
-def of_network(network: nn.Module, purpose: models.Purpose) -> models.Source | None:
+def find_transformers_source(
+    network: nn.Module, purpose: models.Purpose
+) -> models.Source | None:
     """Return the source of an existing network of transformers; None for any other network.
 
     Names come from its ``config``, and the preprocessing from the repository or directory
@@ -129,23 +133,23 @@ def of_network(network: nn.Module, purpose: models.Purpose) -> models.Source | N
     if transformers is None or not isinstance(network, transformers.PreTrainedModel):
         return None
     spec = type(network).__name__
-    kind = _kind(spec, network, spec)
+    kind = _find_family(spec, network, spec)
     origin = str(getattr(network, "name_or_path", "") or "")
     where = {"local_files_only": True}
     processor = None
     if origin:
         # it may not be there any more
-        with suppress(errors.ModelError), reading(spec, ""):
-            processor = processor_of(transformers, origin, where)
-    part = partial(_part, transformers, spec, origin, where)
-    return kind.source(Loaded(network, spec, spec, processor, part, purpose))
+        with suppress(errors.ModelError), report_library_errors(spec, ""):
+            processor = load_processor(transformers, origin, where)
+    part = partial(_load_part, transformers, spec, origin, where)
+    return kind.source(LoadedNetwork(network, spec, spec, processor, part, purpose))
 
 
-def _part(
+def _load_part(
     transformers: Any, spec: str, name: str, where: Mapping[str, Any], loader: str
 ) -> Any:
     """Load another part of a network's repository by the class that loads it."""
-    with reading(
+    with report_library_errors(
         spec, "Give a repository, or a folder, in which it is beside the network"
     ):
         return getattr(transformers, loader).from_pretrained(
@@ -153,7 +157,7 @@ def _part(
         )
 
 
-def _kind(architecture: str, network: Any, spec: str) -> Family:
+def _find_family(architecture: str, network: Any, spec: str) -> Family:
     """Return the first of `NETWORKS` that an architecture belongs to.
 
     Args:
@@ -165,10 +169,10 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
         ModelError: it belongs to none.
     """
     for family in NETWORKS:
-        if isinstance(family.ours, str):
-            matches = bool(re.search(family.ours, architecture))
+        if isinstance(family.matches, str):
+            matches = bool(re.search(family.matches, architecture))
         else:
-            matches = family.ours(architecture, network)
+            matches = family.matches(architecture, network)
         if matches:
             return family
     raise errors.ModelError(
@@ -184,7 +188,7 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
     )
 
 
-def _config(
+def _load_config(
     transformers: Any, name: str, spec: str, where: Mapping[str, Any]
 ) -> Mapping[str, Any]:
     """Return the config of a repository or a directory, as JSON values.
@@ -192,7 +196,7 @@ def _config(
     Raises:
         ModelError: it is a repository of open_clip, or cannot be found.
     """
-    has = partial(cached_file, transformers, name, where=where)
+    has = partial(find_cached_file, transformers, name, where=where)
     try:
         if not has("config.json") and has("open_clip_config.json"):
             raise errors.ModelError(
@@ -214,25 +218,27 @@ def _config(
             for folder in cache.glob("models--*")
         ]
         raise errors.ModelError(
-            f"model {spec}: {name} is no folder here{_near_folders(name)}, and no "
+            f"model {spec}: {name} is no folder here{_suggest_folders(name)}, and no "
             "repository of that name is in the "
-            f"cache{_meant(models.resembling(name, cached))} or can be had "
+            f"cache{_format_suggestions(models.resembling(name, cached))} or can be had "
             f"({models.first_line(error)}). Check the "
             "name and the network, or give a folder"
         ) from error
 
 
-def _out_of_reach(name: str) -> bool:
+def _is_hub_unreachable(name: str) -> bool:
     """Whether the hub does not respond about a repository, not even that there is none."""
     hub = import_module("huggingface_hub")
     try:
-        hub.get_hf_file_metadata(hub.hf_hub_url(name, "config.json"), timeout=PATIENCE)
+        hub.get_hf_file_metadata(
+            hub.hf_hub_url(name, "config.json"), timeout=HUB_TIMEOUT
+        )
     except Exception as error:  # its client's libraries have errors of their own
         return getattr(error, "response", None) is None
     return False
 
 
-def _near_folders(name: str) -> str:
+def _suggest_folders(name: str) -> str:
     """Return the question whether a directory with a similar name is meant, "" if there
     is none.
     """
@@ -241,10 +247,10 @@ def _near_folders(name: str) -> str:
     if path.parent.is_dir():
         siblings = [entry.name for entry in path.parent.iterdir() if entry.is_dir()]
     similar = models.resembling(path.name, siblings)
-    return _meant([str(path.parent / sibling) for sibling in similar])
+    return _format_suggestions([str(path.parent / sibling) for sibling in similar])
 
 
-def _meant(names: Sequence[str]) -> str:
+def _format_suggestions(names: Sequence[str]) -> str:
     """Return the question whether one of these directories or repositories is meant, "" if
     there is none.
     """
@@ -252,7 +258,7 @@ def _meant(names: Sequence[str]) -> str:
     return f" (did you mean {' or '.join(specs)}?)" if specs else ""
 
 
-def _check_whole(network: Any, report: Any, spec: str) -> None:
+def _check_weights(network: Any, report: Any, spec: str) -> None:
     """Check that all weights come from the files: others would be random.
 
     An untrained pooler is removed: it would read the first token, which is then used
@@ -277,18 +283,20 @@ def _check_whole(network: Any, report: Any, spec: str) -> None:
     )
 
 
-def _logits(network: Any, images: Tensor) -> Tensor:
+def _run_classifier(network: Any, images: Tensor) -> Tensor:
     """Return the logits of a network."""
     logits: Tensor = network(pixel_values=images).logits
     return logits
 
 
-def _logits_by_pixel(network: Any, images: Tensor) -> Tensor:
+def _run_segmenter(network: Any, images: Tensor) -> Tensor:
     """Return the logits (N, classes, H, W) of a segmenter, at the size of the images."""
-    return interpolate(_logits(network, images), size=images.shape[2:], mode="bilinear")
+    return interpolate(
+        _run_classifier(network, images), size=images.shape[2:], mode="bilinear"
+    )
 
 
-def _boxes(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
+def _run_detector(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
     """Return boxes (N, queries, 4) in pixels, x0, y0, x1, y1, and scores (N, queries, classes)
     in [0, 1], without suppression.
 
@@ -296,20 +304,24 @@ def _boxes(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
     2020); the others score each class independently.
     """
     returned = network(pixel_values=images)
-    boxes = in_pixels(returned.pred_boxes, images)
+    boxes = to_pixel_corners(returned.pred_boxes, images)
     if returned.logits.shape[-1] > len(network.config.id2label):
         return boxes, returned.logits.softmax(dim=-1)[..., :-1]
     return boxes, returned.logits.sigmoid()
 
 
-def _with_names(ask: Ask, *, boxes: bool = False) -> Callable[[Loaded], models.Source]:
+def _make_named_source(
+    ask: RunNetwork, *, boxes: bool = False
+) -> Callable[[LoadedNetwork], models.Source]:
     """Return the function that makes the source of a network with class names in its
     ``config``.
     """
-    return lambda loaded: loaded.source(ask, boxes=boxes, labels=loaded.names or None)
+    return lambda loaded: loaded.make_source(
+        ask, boxes=boxes, labels=loaded.class_names or None
+    )
 
 
-class _OfFrames:
+class _FrameProcessor:
     """A processor of videos as one of images, each of which is a video of one frame."""
 
     def __init__(self, processor: Any) -> None:
@@ -322,55 +334,68 @@ class _OfFrames:
         return getattr(self.processor, name)
 
 
-def _of_clips(loaded: Loaded) -> models.Source:
+def _make_clip_source(loaded: LoadedNetwork) -> models.Source:
     """Return the source of a network that takes (N, T, 3, H, W): the T frames are the images of
     a rig.
     """
     config = loaded.network.config
-    loaded = replace(loaded, processor=loaded.processor and _OfFrames(loaded.processor))
-    module = models.AllAtOnce(Adapted(loaded.network, _logits), int(config.num_frames))
-    return models.source_of(
-        module, loaded.name, labels=loaded.names or None, **loaded.sized(config)
+    loaded = replace(
+        loaded, processor=loaded.processor and _FrameProcessor(loaded.processor)
+    )
+    module = models.AllAtOnce(
+        AdaptedNetwork(loaded.network, _run_classifier), int(config.num_frames)
+    )
+    return models.make_source(
+        module,
+        loaded.name,
+        labels=loaded.class_names or None,
+        **loaded.get_sized_preprocessing(config),
     )
 
 
 NETWORKS = (
-    Family("ForVideoClassification", "ForVideoClassification", _of_clips),
+    Family("ForVideoClassification", "ForVideoClassification", _make_clip_source),
     Family(
         "TimmWrapperForImageClassification",
         "ForImageClassification",
-        outputs.wrapped_timm,
+        outputs.make_wrapped_timm_source,
     ),
     Family(
         "ForImageClassification",
         "ForImageClassification",
-        partial(outputs.source, plain=_with_names(_logits)),
+        partial(outputs.make_feature_source, plain=_make_named_source(_run_classifier)),
     ),
     Family(
         "ForSemanticSegmentation",
         "ForSemanticSegmentation",
-        _with_names(_logits_by_pixel),
+        _make_named_source(_run_segmenter),
     ),
-    Family(outputs.MASKS, "ForUniversalSegmentation", outputs.mask_source),
+    Family(outputs.MASKS, "ForUniversalSegmentation", outputs.make_mask_source),
     Family(
         f"^({'|'.join(zero_shot.DETECTORS)})$",
         "ForZeroShotObjectDetection",
-        zero_shot.detector,
+        zero_shot.make_detector_source,
     ),
-    Family("ForObjectDetection", "ForObjectDetection", _with_names(_boxes, boxes=True)),
-    Family(language.speaks, "ForImageTextToText", language.source),
-    Family("ForDepthEstimation", "ForDepthEstimation", outputs.depth_source),
     Family(
-        lambda _, network: zero_shot.compares(network),
-        "",
-        partial(outputs.source, plain=zero_shot.source),
+        "ForObjectDetection",
+        "ForObjectDetection",
+        _make_named_source(_run_detector, boxes=True),
     ),
-    Family(outputs.gives_features, None, outputs.source),
+    Family(
+        language.generates_text, "ForImageTextToText", language.make_language_source
+    ),
+    Family("ForDepthEstimation", "ForDepthEstimation", outputs.make_depth_source),
+    Family(
+        lambda _, network: zero_shot.encodes_images_and_texts(network),
+        "",
+        partial(outputs.make_feature_source, plain=zero_shot.make_zero_shot_source),
+    ),
+    Family(outputs.gives_features, None, outputs.make_feature_source),
 )
 """All families that are read, the specific ones first."""
 
 
-MEMORY = Path("/proc/meminfo")  # Linux's file of memory sizes
+MEMORY_FILE = Path("/proc/meminfo")  # Linux's file of memory sizes
 
 
 def check_fits(
@@ -389,12 +414,12 @@ def check_fits(
     if free is None:
         return
     size = 0
-    index = cached_file(transformers, name, "model.safetensors.index.json", where)
+    index = find_cached_file(transformers, name, "model.safetensors.index.json", where)
     if index:  # of several files
         metadata = json.loads(Path(index).read_text(encoding="utf-8"))
         size = int(metadata.get("metadata", {}).get("total_size", 0))
     else:
-        weights = cached_file(transformers, name, "model.safetensors", where)
+        weights = find_cached_file(transformers, name, "model.safetensors", where)
         if weights:
             size = Path(weights).stat().st_size
     if size > free:
@@ -409,7 +434,7 @@ def check_fits(
 def _read_free_memory() -> int | None:
     """Return the free memory in bytes, swap included; None if it is unknown."""
     try:
-        lines = MEMORY.read_text(encoding="ascii").splitlines()
+        lines = MEMORY_FILE.read_text(encoding="ascii").splitlines()
         kilobytes = {
             line.partition(":")[0]: int(line.split()[1])
             for line in lines

@@ -15,17 +15,23 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from advsearch.extend import InputError, errors, models
-from advsearch.models.zoo.library import Adapted, Ask, Loaded, in_pixels, nearly
+from advsearch.models.zoo.library import (
+    AdaptedNetwork,
+    LoadedNetwork,
+    RunNetwork,
+    are_nearly_equal,
+    to_pixel_corners,
+)
 
-TEXTS = 64  # texts that are embedded at once
+TEXT_BATCH_SIZE = 64  # texts that are embedded at once
 
 
-def compares(network: Any) -> bool:
+def encodes_images_and_texts(network: Any) -> bool:
     """Whether a network of transformers, or its class, encodes both images and texts."""
     return all(hasattr(network, f"get_{half}_features") for half in ("image", "text"))
 
 
-def source(loaded: Loaded) -> models.Source:
+def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
     """Return the source of a classifier of the given names.
 
     Raises:
@@ -35,37 +41,37 @@ def source(loaded: Loaded) -> models.Source:
     """
     check_takes_pictures(loaded.network, loaded.spec)
     name = loaded.name
-    names = loaded.purpose.named(
+    names = loaded.purpose.require_names(
         loaded.name, "compares a picture with texts", "classification"
     )
-    prompts = models.patterns(loaded.purpose.prompts)
+    prompts = models.get_patterns(loaded.purpose.prompts)
     if len(names) < 2:
         raise InputError(
             f"labels: expected two names at least, of which model {name} "
             f"chooses one, got {names[0]!r}"
         )
-    tokenizer = loaded.part("AutoTokenizer")
-    words = spoken(names)
+    tokenizer = loaded.load_part("AutoTokenizer")
+    words = get_spoken_names(names)
     has_sigmoid = hasattr(loaded.network, "logit_bias")
     texts = [prompts[0].replace("{}", word) for word in words]
     with (
         models.foreign(f"model {name}: cannot embed the names of `labels`"),
         torch.no_grad(),
     ):
-        network: Any = models.sharing_copy(loaded.network).eval()
+        network: Any = models.copy_sharing_weights(loaded.network).eval()
         if hasattr(network, "temperature"):
             scale = network.temperature.reciprocal()
         else:
             scale = network.logit_scale.exp()
-        embeddings = averaged(network, tokenizer, words, prompts)
+        embeddings = embed_words(network, tokenizer, words, prompts)
         head = nn.Linear(embeddings.shape[1], len(names))
         head.weight.copy_(scale.float() * embeddings)
         bias = network.logit_bias.float() if has_sigmoid else torch.zeros(())
         head.bias.copy_(bias)
-        classifier = _Compared(network, head.to(network.device))
-        result = loaded.with_texts(classifier, names, network.dtype)
-        _check(network, classifier, tokenizer, texts[0], result)
-    say_what_is_one(tokenizer, texts, names, name)
+        classifier = _CosineClassifier(network, head.to(network.device))
+        result = loaded.make_text_source(classifier, names, network.dtype)
+        _check_scores(network, classifier, tokenizer, texts[0], result)
+    warn_of_equal_texts(tokenizer, texts, names, name)
     if has_sigmoid:
         models.warn(
             f"model {name} judges each name by itself, with a sigmoid of its logit: "
@@ -89,7 +95,7 @@ def check_takes_pictures(network: Any, spec: str) -> None:
         )
 
 
-def spoken(names: Sequence[str]) -> list[str]:
+def get_spoken_names(names: Sequence[str]) -> list[str]:
     """Return the text of each name: the first of its synonyms separated by commas, if no
     other name has the same.
     """
@@ -100,7 +106,7 @@ def spoken(names: Sequence[str]) -> list[str]:
     ]
 
 
-def _encoded(
+def _tokenize(
     network: Any, tokenizer: Any, texts: Sequence[str]
 ) -> Mapping[str, Tensor]:
     """Tokenize texts as the network was trained on them: SigLIP's are padded to the
@@ -135,7 +141,7 @@ def _encoded(
     }
 
 
-def averaged(
+def embed_words(
     network: Any, tokenizer: Any, words: Sequence[str], prompts: Sequence[str]
 ) -> Tensor:
     """Embed each word in each prompt, and average over prompts.
@@ -150,22 +156,24 @@ def averaged(
     for prompt in prompts:
         texts = [prompt.replace("{}", word) for word in words]
         batches = []
-        for start in range(0, len(texts), TEXTS):
-            inputs = _encoded(network, tokenizer, texts[start : start + TEXTS])
-            batches.append(_pooled(network.get_text_features(**inputs)))
+        for start in range(0, len(texts), TEXT_BATCH_SIZE):
+            inputs = _tokenize(
+                network, tokenizer, texts[start : start + TEXT_BATCH_SIZE]
+            )
+            batches.append(_get_features(network.get_text_features(**inputs)))
         embeddings = functional.normalize(torch.cat(batches), dim=-1)
         embeddings_of_prompts.append(embeddings)
     mean = torch.stack(embeddings_of_prompts).mean(dim=0)
     return functional.normalize(mean, dim=-1)
 
 
-def _pooled(returned: Any) -> Tensor:
+def _get_features(returned: Any) -> Tensor:
     """Return the features (N, D), float32, in an output of an encoder."""
     features: Tensor = getattr(returned, "pooler_output", returned)
     return features.float()
 
 
-class _Compared(nn.Module):
+class _CosineClassifier(nn.Module):
     """Compute logits (N, names): the scaled cosine of an image and each name.
 
     The text encoder is left out.
@@ -173,25 +181,25 @@ class _Compared(nn.Module):
 
     def __init__(self, network: nn.Module, head: nn.Linear) -> None:
         super().__init__()
-        self.network: Any = models.sharing_copy(network)
+        self.network: Any = models.copy_sharing_weights(network)
         for child in [name for name, _ in self.network.named_children()]:
             if child.startswith("text"):
                 setattr(self.network, child, None)
         self.head = head
 
-    def seen(self, images: Tensor) -> Tensor:
+    def embed_images(self, images: Tensor) -> Tensor:
         """Return the features (N, D) of length 1 of images."""
-        features = _pooled(self.network.get_image_features(pixel_values=images))
+        features = _get_features(self.network.get_image_features(pixel_values=images))
         return functional.normalize(features, dim=-1)
 
     def forward(self, images: Tensor) -> Tensor:
-        scores: Tensor = self.head(self.seen(images))
+        scores: Tensor = self.head(self.embed_images(images))
         return scores
 
 
-def _check(
+def _check_scores(
     network: Any,
-    classifier: _Compared,
+    classifier: _CosineClassifier,
     tokenizer: Any,
     text: str,
     source: models.Source,
@@ -204,13 +212,13 @@ def _check(
     shape = (1, 3, *(source.input_size or (224, 224)))
     noise = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     noise = noise.to(network.device, network.dtype)
-    inputs = _encoded(network, tokenizer, [text])
+    inputs = _tokenize(network, tokenizer, [text])
     expected = network(**inputs, pixel_values=noise).logits_per_image.float()
     scale = classifier.head.weight.norm(dim=-1).max()
-    embedding = scale * averaged(network, tokenizer, [text], ["{}"])
-    computed = classifier.seen(noise) @ embedding.T + classifier.head.bias[0]
+    embedding = scale * embed_words(network, tokenizer, [text], ["{}"])
+    computed = classifier.embed_images(noise) @ embedding.T + classifier.head.bias[0]
     size = max(float(scale), float(expected.abs().max()))
-    if expected.shape != computed.shape or not nearly(
+    if expected.shape != computed.shape or not are_nearly_equal(
         expected, computed, size, network.dtype
     ):
         raise errors.ModelError(
@@ -220,7 +228,7 @@ def _check(
         )
 
 
-def say_what_is_one(
+def warn_of_equal_texts(
     tokenizer: Any, texts: Sequence[str], names: Sequence[str], name: str
 ) -> None:
     """Warn of the first two names with the same tokens: they differ in case, say, or are
@@ -239,37 +247,43 @@ def say_what_is_one(
             return
 
 
-Build = Callable[[Loaded, Any, Any, Sequence[str]], Ask]
+BuildDetector = Callable[[LoadedNetwork, Any, Any, Sequence[str]], RunNetwork]
 """Creates the function that runs a detector, from what was loaded, a copy of its
 network, its tokenizer and the text of each name. It returns boxes (N, K, 4) in pixels,
 x0, y0, x1, y1, and independent scores (N, K, names) in [0, 1].
 """
 
 
-def detector(loaded: Loaded) -> models.Source:
+def make_detector_source(loaded: LoadedNetwork) -> models.Source:
     """Return the source of a detector of the given names, with a network of `DETECTORS`."""
-    names = loaded.purpose.named(loaded.name, "finds what it is told to", "detection")
-    tokenizer = loaded.part("AutoTokenizer")
-    words = spoken(names)
+    names = loaded.purpose.require_names(
+        loaded.name, "finds what it is told to", "detection"
+    )
+    tokenizer = loaded.load_part("AutoTokenizer")
+    words = get_spoken_names(names)
     with (
         models.foreign(f"model {loaded.name}: cannot read the names of `labels`"),
         torch.no_grad(),
     ):
-        network: Any = models.sharing_copy(loaded.network).eval()
+        network: Any = models.copy_sharing_weights(loaded.network).eval()
         ask = DETECTORS[type(network).__name__](loaded, network, tokenizer, words)
-    say_what_is_one(tokenizer, words, names, loaded.name)
-    return loaded.with_texts(Adapted(network, ask, boxes=True), names, network.dtype)
+    warn_of_equal_texts(tokenizer, words, names, loaded.name)
+    return loaded.make_text_source(
+        AdaptedNetwork(network, ask, boxes=True), names, network.dtype
+    )
 
 
-def _owl(loaded: Loaded, network: Any, tokenizer: Any, words: Sequence[str]) -> Ask:
+def _build_owl(
+    loaded: LoadedNetwork, network: Any, tokenizer: Any, words: Sequence[str]
+) -> RunNetwork:
     """Compare each patch of the image, which is one box, with the text of each name
     (Minderer et al. 2022, arXiv 2205.06230, section 3).
 
     The texts of a name are averaged as CLIP's are. OWL's text encoder is then removed.
     """
     base_model = getattr(network, network.base_model_prefix)
-    prompts = models.patterns(loaded.purpose.prompts)
-    embeddings = averaged(base_model, tokenizer, words, prompts).to(network.dtype)
+    prompts = models.get_patterns(loaded.purpose.prompts)
+    embeddings = embed_words(base_model, tokenizer, words, prompts).to(network.dtype)
     base_model.text_model = None
     base_model.text_projection = None
 
@@ -279,21 +293,21 @@ def _owl(loaded: Loaded, network: Any, tokenizer: Any, words: Sequence[str]) -> 
         queries = embeddings.to(patches).expand(len(images), -1, -1)
         logits, _ = network.class_predictor(patches, queries)
         boxes = network.box_predictor(patches, features)
-        return in_pixels(boxes, images), logits.sigmoid()
+        return to_pixel_corners(boxes, images), logits.sigmoid()
 
     return ask
 
 
-def _grounded(
-    loaded: Loaded, network: Any, tokenizer: Any, words: Sequence[str]
-) -> Ask:
+def _build_grounding_dino(
+    loaded: LoadedNetwork, network: Any, tokenizer: Any, words: Sequence[str]
+) -> RunNetwork:
     """Read all names as one text, ``mug. cup. bowl.``, and score boxes by its tokens
     (Liu et al. 2023, arXiv 2303.05499, section 3).
 
     The score of a name is the largest of its tokens.
     """
     name = loaded.name
-    prompt, *other_prompts = models.patterns(loaded.purpose.prompts or ("{}",))
+    prompt, *other_prompts = models.get_patterns(loaded.purpose.prompts or ("{}",))
     if other_prompts:
         raise InputError(
             f"prompt: model {name} reads all names in one text, in which several "
@@ -324,7 +338,7 @@ def _grounded(
             pixel_values=images, input_ids=tokens.expand(len(images), -1)
         )
         name_logits = returned.logits[..., token_index].amax(dim=-1)
-        return in_pixels(returned.pred_boxes, images), name_logits.sigmoid()
+        return to_pixel_corners(returned.pred_boxes, images), name_logits.sigmoid()
 
     return ask
 
@@ -343,10 +357,10 @@ def _find_token_runs(tokens: Tensor, separators: Any) -> Tensor:
     return torch.stack(padded) if padded else token_index.new_zeros((0, 0))
 
 
-DETECTORS: dict[str, Build] = {
-    "OwlViTForObjectDetection": _owl,
-    "Owlv2ForObjectDetection": _owl,
-    "GroundingDinoForObjectDetection": _grounded,
-    "MMGroundingDinoForObjectDetection": _grounded,
+DETECTORS: dict[str, BuildDetector] = {
+    "OwlViTForObjectDetection": _build_owl,
+    "Owlv2ForObjectDetection": _build_owl,
+    "GroundingDinoForObjectDetection": _build_grounding_dino,
+    "MMGroundingDinoForObjectDetection": _build_grounding_dino,
 }
 """Builders of detectors by architecture."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from advsearch.experiment import RunContext, experiment
-from advsearch.questions.attack.display import claims, shown
-from advsearch.questions.attack.page import page
+from advsearch.questions.attack.display import make_attack_claims, make_attack_view
+from advsearch.questions.attack.page import make_page
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import (
     BY_FIELD,
@@ -20,9 +20,9 @@ from advsearch.questions.attack.summary import (
     "--seed 1",
     "attack --object mug --model reference,torchvision:resnet18 --label mug,cup",
     python_function="advsearch.questions.attack.python:attack",
-    view=shown,
-    claims=claims,
-    page=page,
+    view=make_attack_view,
+    claims=make_attack_claims,
+    page=make_page,
     other_results=BY_FIELD,
 )
 def attack(

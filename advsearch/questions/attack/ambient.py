@@ -10,7 +10,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Ending, verify
-from advsearch.engine.journal import ProblemKey, Shared
+from advsearch.engine.journal import ParallelEvaluator, ProblemKey
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import Verifier
 
@@ -34,19 +34,21 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
         u: (d,) the configuration.
     """
     problem = verifier.problem
-    findings = verifier.findings
+    findings = verifier.state
     scene_lux = _find_scene_lux(problem)
     if scene_lux is None or findings.verification is None:
         return
-    findings.ambient[scene_lux] = findings.verification
+    findings.ambient_verifications[scene_lux] = findings.verification
 
     def holds(lux: float) -> bool:
         title = f"trying it in ambient light of {lux:.3g} lux"
-        verifier.begin(title, 2 * verifier.count, name="ambient", at_most=True)
+        verifier.begin_stage(title, 2 * verifier.n_trials, name="ambient", at_most=True)
         factor = lux / scene_lux
-        traced = verifier.journal.traced
-        traced_in_light = Shared(in_light(problem, factor), traced.executor, factor)
-        journal = replace(verifier.journal, traced=traced_in_light)
+        traced = verifier.journal.evaluator
+        traced_in_light = ParallelEvaluator(
+            with_ambient_light(problem, factor), traced.executor, factor
+        )
+        journal = replace(verifier.journal, evaluator=traced_in_light)
         verification = verify(
             replace(verifier, journal=journal).evaluate_all,
             problem.domain,
@@ -57,9 +59,9 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
             trials=verifier.looks,
             rule=problem.rule,
             kind=f"ambient {lux:.6g} lux",
-            control=f"control {lux:.6g} lux",
+            control_kind=f"control {lux:.6g} lux",
         )
-        findings.ambient[lux] = verification
+        findings.ambient_verifications[lux] = verification
         return verification.ending is Ending.FOUND
 
     good_lux = scene_lux
@@ -67,7 +69,7 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     while bad_lux <= MAX_LUX and holds(bad_lux):
         good_lux = bad_lux
         bad_lux = 2.0 * bad_lux
-    if bad_lux not in findings.ambient:
+    if bad_lux not in findings.ambient_verifications:
         return  # it holds in direct sun
     for _ in range(N_BISECTIONS):
         middle_lux = (good_lux * bad_lux) ** 0.5
@@ -88,13 +90,13 @@ def _find_scene_lux(problem: Problem) -> float | None:
     return None
 
 
-def problems_by_key(problem: Problem) -> Callable[[ProblemKey], Problem]:
+def make_problem_finder(problem: Problem) -> Callable[[ProblemKey], Problem]:
     """Return the function by which a worker finds the problem of a query.
 
     A number as the key is a factor on the ambient light; any other key is the problem
     of the run.
     """
-    in_other_light = lru_cache(maxsize=2)(partial(in_light, problem))
+    in_other_light = lru_cache(maxsize=2)(partial(with_ambient_light, problem))
 
     def find_problem(key: ProblemKey) -> Problem:
         return in_other_light(key) if isinstance(key, float) else problem
@@ -102,10 +104,10 @@ def problems_by_key(problem: Problem) -> Callable[[ProblemKey], Problem]:
     return find_problem
 
 
-def in_light(problem: Problem, factor: float) -> Problem:
+def with_ambient_light(problem: Problem, factor: float) -> Problem:
     """Return the problem with its ambient light multiplied by a factor."""
-    controls = [control.in_light(factor) for control in problem.space.controls]
+    controls = [control.scale_ambient(factor) for control in problem.space.controls]
     space = replace(problem.space, controls=tuple(controls))
-    renderer = problem.renderer.like()
+    renderer = problem.renderer.copy_with()
     renderer.space = space
     return replace(problem, space=space, renderer=renderer)

@@ -1,7 +1,7 @@
 """Load the parts of an attack from its settings, and make its problem of these.
 
  Everything that renders and judges single
-configurations begins with `problem_from_config` or `problem_of`;
+configurations begins with `problem_from_config` or `make_problem_on`;
 `advsearch.questions.attack.run` attacks.
 """
 
@@ -18,42 +18,56 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Policy, make_policy
-from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective
+from advsearch.attacks.objectives import (
+    OBJECTIVE_KINDS,
+    check_objective,
+    list_requested_inputs,
+)
 from advsearch.attacks.policies import POLICIES
-from advsearch.cluster import Call, Workers, WorkerTask
+from advsearch.cluster import BatchFunction, Workers, WorkerTask
 from advsearch.cluster.workers import open_workers
-from advsearch.config import SceneConfig, has_address, one_only
+from advsearch.config import SceneConfig, has_address, make_single_value_error
 from advsearch.controls import make_space
-from advsearch.controls.base import Control, sentences
-from advsearch.controls.ranges import by_distribution
+from advsearch.controls.base import Control, describe_adjusted_defaults
+from advsearch.controls.ranges import has_distribution
 from advsearch.engine import judging, loading, naming
-from advsearch.engine.journal import worker_call
-from advsearch.engine.judging import AnyObjective, Described, Looked, Metrics
-from advsearch.engine.loading import Controls, Scene, framed
-from advsearch.engine.naming import AnyModel, load_models, several
+from advsearch.engine.journal import make_worker_call
+from advsearch.engine.judging import (
+    AnyObjective,
+    DescribeConfiguration,
+    Metrics,
+    RenderSurfaces,
+)
+from advsearch.engine.loading import Controls, Scene, fit_camera
+from advsearch.engine.naming import AnyModel, list_models, load_models
 from advsearch.engine.problem import Problem
-from advsearch.engine.rendering import facts_about
-from advsearch.engine.transport import CleanMatrix, refusal_of_matrices
+from advsearch.engine.rendering import make_facts
+from advsearch.engine.transport import CleanMatrix, find_matrix_refusal
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
-from advsearch.options import as_setting
+from advsearch.options import to_setting
 from advsearch.progress import Progress
-from advsearch.questions.attack.ambient import problems_by_key
+from advsearch.questions.attack.ambient import make_problem_finder
 from advsearch.questions.attack.settings import (
-    OVER_NUMBERS,
-    OVER_ONE,
-    OVER_PREDICTED,
-    OVER_RENDERED,
+    SIZE_OVER_NUMBERS,
+    SIZE_OVER_ONE_NUMBER,
+    SIZE_OVER_PREDICTED,
+    SIZE_OVER_RENDERED,
     STEPS,
     AttackConfig,
 )
 from advsearch.runs.directory import CONFIG, read_python_only
-from advsearch.scene.formation import EVERYTHING, NOTHING, aovs_of, next_count
-from advsearch.scene.things import ALL
+from advsearch.scene.formation import (
+    ALL_OMISSIONS,
+    NO_OMISSIONS,
+    parse_aovs,
+    round_sample_count,
+)
+from advsearch.scene.things import ALL_THINGS
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, Task, make_task
-from advsearch.tasks.together import Together, each_thing, together
+from advsearch.tasks.together import EnsembleTask, join_models, make_each_thing_task
 
 # the first stage of the progress
 LOADING = "loading the scene and the model"
@@ -61,14 +75,14 @@ ROLES_IN_SEARCH = frozenset({"objective", "policy", "metric"})
 """Roles of parts that decide how a scene is found, but not whether it is a success."""
 
 
-def attack_worker(settings: JsonObject) -> Call:
+def attack_worker(settings: JsonObject) -> BatchFunction:
     """Return the function by which a worker evaluates queries of an attack.
 
     Args:
         settings: of the attack.
     """
-    problem = problem_on(parts_of(AttackConfig(**settings)))
-    return worker_call(problems_by_key(problem))
+    problem = make_problem(load_parts(AttackConfig(**settings)))
+    return make_worker_call(make_problem_finder(problem))
 
 
 @dataclass
@@ -78,32 +92,32 @@ class AttackParts:
     Attributes:
         config: the settings.
         scene: the clean scene.
-        loaded: the model, and warnings of loading it.
+        model_and_warnings: the model, and warnings of loading it.
         task: not yet bound to the model.
         controls: the searched ones.
-        over: those that vary by chance.
+        random_controls: those that vary by chance.
         objective: a name, or the caller's function.
         policy: may be the caller's.
-        keep: whether the run is stored.
+        is_stored: whether the run is stored.
         metrics: columns of the rows, by name.
-        clean: the matrix of light transport of the clean scene, which attacks may
+        clean_matrix: the matrix of light transport of the clean scene, which attacks may
             share.
     """
 
     config: AttackConfig
     scene: Scene
-    loaded: tuple[Model, list[str]]
+    model_and_warnings: tuple[Model, list[str]]
     task: Task
     controls: tuple[Any, ...]
-    over: tuple[Any, ...]
+    random_controls: tuple[Any, ...]
     objective: str | Callable[..., Tensor]
     policy: Policy[Any]
-    keep: bool
+    is_stored: bool
     metrics: Metrics = field(default_factory=dict)
-    clean: CleanMatrix = field(default_factory=CleanMatrix)
+    clean_matrix: CleanMatrix = field(default_factory=CleanMatrix)
 
 
-def parts_of(
+def load_parts(
     config: AttackConfig, scene: Scene | None = None, model: Model | None = None
 ) -> AttackParts:
     """Load everything that a configuration names; nothing is rendered.
@@ -114,14 +128,14 @@ def parts_of(
         model: likewise; with both, the attack is not stored.
     """
     if scene is None and len(config.objects) > 1:
-        raise one_only("object", config.objects)
-    searched, sampled = controls_given(config, config.controls, config.over)
-    task, objective = task_and_objective(config, config.task, config.objective)
+        raise make_single_value_error("object", config.objects)
+    searched, sampled = make_attack_controls(config, config.controls, config.over)
+    task, objective = make_task_and_objective(config, config.task, config.objective)
     policy = make_policy(config.policy_name, **config.policy_options)
     keep = scene is None or model is None
-    scene = scene or naming.scene_of(config)
+    scene = scene or naming.load_configured_scene(config)
     if model is None:
-        loaded = models_as_one(config.model, config, task)
+        loaded = load_ensemble(config.model, config, task)
     else:
         loaded = (model, [])
     metrics = judging.load_metrics(config.metrics) if keep else {}
@@ -130,7 +144,7 @@ def parts_of(
     )
 
 
-def parts_in(run: Path) -> AttackParts:
+def load_parts_of_run(run: Path) -> AttackParts:
     """Load what the run of an attack used, as its result is evaluated.
 
     Raises:
@@ -144,10 +158,10 @@ def parts_in(run: Path) -> AttackParts:
             f"{run}: {', '.join(missing)}: only the Python session that "
             "asked has what judges its result"
         )
-    return parts_of(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
+    return load_parts(with_evaluation_only(AttackConfig.from_yaml(run / CONFIG)))
 
 
-def controls_given(
+def make_attack_controls(
     config: AttackConfig, searched: Controls, random: Controls
 ) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
     """Return the searched controls and those that vary by chance, with their settings.
@@ -161,20 +175,20 @@ def controls_given(
         InputError: a searched control has a distribution.
     """
     naming.check_run_settings(config)
-    controls = naming.given_to(config, searched)
+    controls = naming.make_configured_controls(config, searched)
     for control in controls:
         for name, spec in getattr(control, "specs", {}).items():
-            if by_distribution(spec):
+            if has_distribution(spec):
                 raise InputError(
                     f"`controls` {control.name}.{name}: expected values to search, "
                     "which are all as good, got how "
                     "likely each is; give a range, or put it into `over`, under which "
                     "it varies by chance"
                 )
-    return controls, naming.given_to(config, random, are_searched=False)
+    return controls, naming.make_configured_controls(config, random, are_searched=False)
 
 
-def task_and_objective(
+def make_task_and_objective(
     config: AttackConfig, task: AnyTask, objective: AnyObjective | None
 ) -> tuple[Task, AnyObjective]:
     """Make a task and choose its objective.
@@ -198,14 +212,14 @@ def task_and_objective(
     return new_task, chosen
 
 
-def models_as_one(
+def load_ensemble(
     model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Task
 ) -> tuple[Model, list[str]]:
     """Load models, several as one ensemble; return it and warnings."""
-    models, warnings = load_models(several(model), task, config)
+    models, warnings = load_models(list_models(model), task, config)
     if len(models) == 1:
         return models[0], warnings
-    return together(models, config.resolution), warnings
+    return join_models(models, config.resolution), warnings
 
 
 def check_from_config(config: AttackConfig) -> None:
@@ -215,10 +229,13 @@ def check_from_config(config: AttackConfig) -> None:
         InputError: the settings name what does not exist, contradict themselves, or
             give a result that cannot be evaluated.
     """
-    parts = parts_of(config)
+    parts = load_parts(config)
     _bind_task(parts, shows=False)
-    size = config.resolution or parts.loaded[0].input_size
-    make_space((*parts.controls, *parts.over), framed(parts.scene.description, size))
+    size = config.resolution or parts.model_and_warnings[0].input_size
+    make_space(
+        (*parts.controls, *parts.random_controls),
+        fit_camera(parts.scene.description, size),
+    )
 
 
 def problem_from_config(
@@ -233,11 +250,11 @@ def problem_from_config(
     Returns:
         The problem, and warnings of loading it.
     """
-    attack_config = AttackConfig.of(config, denoise=denoise or config.denoise)
-    return problem_of_parts(parts_of(attack_config))
+    attack_config = AttackConfig.from_config(config, denoise=denoise or config.denoise)
+    return make_problem_with_warnings(load_parts(attack_config))
 
 
-def problem_of_parts(
+def make_problem_with_warnings(
     parts: AttackParts, **changes: object
 ) -> tuple[Problem, list[str]]:
     """Return the problem of an attack, and warnings of loading it.
@@ -247,16 +264,19 @@ def problem_of_parts(
         **changes: other settings; of another `model`, its name.
     """
     config = parts.config.model_copy(update=changes)
-    model, warnings = parts.loaded
+    model, warnings = parts.model_and_warnings
     if "model" in changes:
-        loaded = models_as_one(config.model, config, parts.task)
+        loaded = load_ensemble(config.model, config, parts.task)
     else:
         loaded = (model, [*warnings])
-    problem = problem_on(replace(parts, config=config, loaded=loaded))
-    return problem, [*loaded[1], *sentences(problem.space.moved)]
+    problem = make_problem(replace(parts, config=config, model_and_warnings=loaded))
+    return problem, [
+        *loaded[1],
+        *describe_adjusted_defaults(problem.space.adjusted_defaults),
+    ]
 
 
-def problem_of(
+def make_problem_on(
     config: AttackConfig, scene: Scene, model: Model, *, differentiated: bool = True
 ) -> Problem:
     """Return the problem of a configuration on a loaded scene and a loaded model.
@@ -267,10 +287,10 @@ def problem_of(
         model: used instead.
         differentiated: whether derivatives are needed.
     """
-    return problem_on(parts_of(config, scene, model), differentiated=differentiated)
+    return make_problem(load_parts(config, scene, model), differentiated=differentiated)
 
 
-def problem_on(parts: AttackParts, *, differentiated: bool = True) -> Problem:
+def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
     """Make the problem of an attack: what renders and evaluates configurations.
 
     Warnings are added to those of loading the model.
@@ -283,11 +303,11 @@ def problem_on(parts: AttackParts, *, differentiated: bool = True) -> Problem:
         InputError: the parts do not fit together.
     """
     config = parts.config
-    model, warnings = parts.loaded
+    model, warnings = parts.model_and_warnings
     task, facts = _bind_task(parts)
     resolution = config.resolution or model.input_size
-    description = framed(parts.scene.description, resolution)
-    space = make_space((*parts.controls, *parts.over), description)
+    description = fit_camera(parts.scene.description, resolution)
+    space = make_space((*parts.controls, *parts.random_controls), description)
     renderer = loading.make_renderer(
         description,
         space,
@@ -295,12 +315,12 @@ def problem_on(parts: AttackParts, *, differentiated: bool = True) -> Problem:
         config.denoise,
         config.seed,
         config.estimators,
-        leave_out=EVERYTHING if config.specialise else NOTHING,
+        leave_out=ALL_OMISSIONS if config.specialise else NO_OMISSIONS,
         sampler=config.pixel_sampler,
         differentiated=differentiated,
     )
     features_seed = seeds.stream(config.seed, "clean features")
-    objective, note = judging.objective_for(
+    objective, note = judging.make_objective(
         parts.objective, task, model, renderer, features_seed, config.ensemble
     )
     if note:
@@ -308,7 +328,7 @@ def problem_on(parts: AttackParts, *, differentiated: bool = True) -> Problem:
     if config.printable:
         searched_space = make_space(parts.controls, description)
         # raises where nothing can be printed
-        judging.print_terms(searched_space, searched_space.start)
+        judging.measure_print_terms(searched_space, searched_space.start)
     problem = Problem(
         renderer,
         space,
@@ -316,22 +336,24 @@ def problem_on(parts: AttackParts, *, differentiated: bool = True) -> Problem:
         task,
         facts,
         objective,
-        next_count(config.pixel_sampler, config.search_spp),
+        round_sample_count(config.pixel_sampler, config.search_spp),
         config.seed,
-        searched=len(parts.controls),
-        aovs=aovs_of(config.aov),
+        n_searched=len(parts.controls),
+        aovs=parse_aovs(config.aov),
         metrics=parts.metrics,
     )
-    for name in asked_by(parts.objective):
+    for name in list_requested_inputs(parts.objective):
         # raises where the objective needs what there is not
-        problem.asked(problem.whole(problem.domain.start))(name)
-    problem.steps, problem.draws = search_size(config, problem)
+        problem.make_objective_inputs(problem.add_conditions(problem.domain.start))(
+            name
+        )
+    problem.steps, problem.n_draws = choose_search_size(config, problem)
     return problem
 
 
 def _bind_task(
     parts: AttackParts, *, shows: bool = True
-) -> tuple[Task, Callable[[Described, Looked], Facts]]:
+) -> tuple[Task, Callable[[DescribeConfiguration, RenderSurfaces], Facts]]:
     """Bind the task of an attack to its model.
 
     Args:
@@ -342,21 +364,21 @@ def _bind_task(
         The task, and the function that gives it the ground truth of a configuration.
     """
     config = parts.config
-    model, warnings = parts.loaded
+    model, warnings = parts.model_and_warnings
     task = parts.task
     if isinstance(parts.objective, str):
-        task = task.seeking(parts.objective)
-    task = judging.task_for(task, model).on(
+        task = task.with_objective(parts.objective)
+    task = judging.make_ensemble_task(task, model).on(
         model, target=config.target, minimise=config.minimise
     )
     facts = partial(
-        facts_about,
+        make_facts,
         parts.scene.description,
         config.object,
         config.label,
         judge=config.judge,
     )
-    ensemble = task if isinstance(task, Together) else None
+    ensemble = task if isinstance(task, EnsembleTask) else None
     members = [(task, model)]
     if ensemble is not None:
         members = list(zip(ensemble.tasks, ensemble.models, strict=True))
@@ -364,7 +386,7 @@ def _bind_task(
     for member, network in members:
         known = facts(dict)
         if ensemble is not None:
-            known = ensemble.told(member, known)
+            known = ensemble.select_facts(member, known)
         judging.check_truth(member, network, parts.scene, known, config.image_settings)
         if shows:
             member = judging.calibrate_task(
@@ -381,23 +403,23 @@ def _bind_task(
         task = member_tasks[0]
     else:
         task = replace(ensemble, tasks=tuple(member_tasks))
-    if config.judge == ALL:
-        task = each_thing(task)
+    if config.judge == ALL_THINGS:
+        task = make_each_thing_task(task)
     return task, facts
 
 
-def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
+def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
     """Return the steps of a search, and the conditions that each evaluates."""
     if problem.conditions is None:
         return config.steps or STEPS, 1
-    default = OVER_PREDICTED
+    default = SIZE_OVER_PREDICTED
     if problem.conditions.dim == 1:
-        default = OVER_ONE
+        default = SIZE_OVER_ONE_NUMBER
     steps = config.steps or default[0]
-    if refusal_of_matrices(problem, steps, config.specialise) is not None:
+    if find_matrix_refusal(problem, steps, config.specialise) is not None:
         # Conditions are rendered.
         is_box = all(block.norm == "box" for block in problem.domain.blocks)
-        default = OVER_NUMBERS if is_box else OVER_RENDERED
+        default = SIZE_OVER_NUMBERS if is_box else SIZE_OVER_RENDERED
     default_steps, default_draws = default
     return config.steps or default_steps, config.draws or default_draws
 
@@ -410,12 +432,12 @@ def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
         make: makes one from a setting.
     """
     try:
-        return bool(make(as_setting(entry)) == entry)
+        return bool(make(to_setting(entry)) == entry)
     except InputError:
         return False
 
 
-def judged_alone(config: AttackConfig) -> AttackConfig:
+def with_evaluation_only(config: AttackConfig) -> AttackConfig:
     """Return the settings with which the adversarial scene of a run is evaluated.
 
     Success depends on no metric, and not on the objective or the policy that searched,
@@ -429,7 +451,7 @@ def judged_alone(config: AttackConfig) -> AttackConfig:
     return config.model_copy(update=changes)
 
 
-def executor_for(
+def open_executor(
     config: SceneConfig, function: str, progress: Progress
 ) -> AbstractContextManager[Workers | None]:
     """Return the workers that run a function of a configuration.
@@ -445,7 +467,7 @@ def executor_for(
         InputError: the model is behind an address, which one process asks.
     """
     in_process = {"workers": None, "cluster": None}
-    worker_settings = config.to_repeat().model_copy(update=in_process).plain()
+    worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
     work = WorkerTask(function, worker_settings, FILES, config.used_threads or 1)
     workers = getattr(config, "workers", None)
     cluster = getattr(config, "cluster", None)

@@ -28,7 +28,7 @@ AttackResults = AttackSummary | CurveResult | MatrixResult
 ENDING_MARKS = {"found": " *", "already wrong": " (wrong already)"}
 
 
-def shown(result: AttackResults) -> ShownResult:
+def make_attack_view(result: AttackResults) -> ShownResult:
     """Return the view of an attack, a curve or a matrix."""
     if isinstance(result, CurveResult):
         return _view_curve(result)
@@ -37,7 +37,7 @@ def shown(result: AttackResults) -> ShownResult:
     return _view_attack(result)
 
 
-def claims(result: AttackResults) -> Iterator[Claim]:
+def make_attack_claims(result: AttackResults) -> Iterator[Claim]:
     """Yield what an attack, a curve or a matrix claims."""
     if isinstance(result, CurveResult):
         yield from _curve_claims(result)
@@ -82,10 +82,10 @@ def _view_attack(summary: AttackSummary) -> ShownResult:
     """Return the view of one attack."""
     sections = [_rates_part(summary)]
     if summary.failures and summary.failures.tried:
-        sections.append(failures_part(summary.failures, tried=True))
-    sections += ambient_part(summary)
+        sections.append(make_failures_part(summary.failures, tried=True))
+    sections += make_ambient_parts(summary)
     cautions = [
-        text for text in wording.remarks(summary) if text not in summary.warnings
+        text for text in wording.make_remarks(summary) if text not in summary.warnings
     ]
     over = ""
     if summary.over:
@@ -119,7 +119,7 @@ def _rates_part(summary: AttackSummary) -> ResultPart:
     clean = summary.clean
     baseline = summary.baseline
     average = summary.average
-    success = wording.success(summary)
+    success = wording.success_name(summary)
     prediction = words.prediction_cells(summary.task, clean)
     rows = [["clean", *prediction, *_rate_cells("right", clean.control)]]
     if summary.adversarial:
@@ -151,7 +151,7 @@ def _rate_cells(
     return text, words.interval_text(rate.interval)
 
 
-def ambient_part(summary: AttackSummary) -> list[ResultPart]:
+def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
     """Return the section about ambient light, if it was tried."""
     light = summary.ambient
     if light is None:
@@ -167,7 +167,9 @@ def ambient_part(summary: AttackSummary) -> list[ResultPart]:
     columns: Mapping[str, Column] = {
         "ambient light": "{0.lux:.3g} lux",
         "wrong": lambda point: words.tally(
-            wording.success(summary), point.verified.successes, point.verified.trials
+            wording.success_name(summary),
+            point.verified.successes,
+            point.verified.trials,
         ),
         "95 % interval": lambda point: words.interval_text(point.verified.interval),
         "": lambda point: "holds" if point.holds else "ends",
@@ -205,11 +207,11 @@ def failures_text(failures: DifferentFailures) -> str:
     )
 
 
-def failures_part(known: DifferentFailures, *, tried: bool = False) -> ResultPart:
+def make_failures_part(known: DifferentFailures, *, tried: bool = False) -> ResultPart:
     """Return the table of different failures; with `tried` only of those in trials."""
     columns: Mapping[str, Column] = {
         "failures": range_text,
-        "most often predicted": most_predicted,
+        "most often predicted": most_frequent_label,
         "holds in fresh renders": _holds_text,
         "objective": lambda failure: words.number_text(failure.objective),
     }
@@ -244,7 +246,7 @@ def range_text(failure: DifferentFailure) -> str:
     return ", ".join(texts) or "anywhere"
 
 
-def most_predicted(failure: DifferentFailure) -> str:
+def most_frequent_label(failure: DifferentFailure) -> str:
     """Return the most frequent label in the trials of a failure; empty without any."""
     return next(iter(failure.verified.labels), "") if failure.verified else ""
 
@@ -273,7 +275,7 @@ def _view_curve(result: CurveResult) -> ShownResult:
         only="page" if has_chart else "notebook",
     )
     point_columns: Mapping[str, Column] = {
-        "epsilon": lambda point: plain_epsilon(point.epsilon) or "own",
+        "epsilon": lambda point: epsilon_text(point.epsilon) or "own",
         "robust": "{0.robust}/{0.objects}",
         "accuracy": lambda point: words.percent(point.accuracy),
         "95 % interval": lambda point: words.interval_text(point.interval),
@@ -305,7 +307,7 @@ def _objects_part(result: CurveResult) -> ResultPart:
             f"{row.clean.correct}/{row.clean.trials}" if row.clean else ""
         ),
         "ending": lambda row: row.ending or "not reached",
-        "epsilon": lambda row: plain_epsilon(row.epsilon),
+        "epsilon": lambda row: epsilon_text(row.epsilon),
         "wrong": lambda row: (
             f"{row.verified.successes}/{row.verified.trials}" if row.verified else ""
         ),
@@ -359,14 +361,14 @@ def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
         return f"The model is wrong about {row.object} as it is."
     if row.flips_at is None:
         return f"{row.object} is recognised{at(row.tried)}."
-    return f"{row.object} is first got wrong at epsilon {plain_epsilon(row.flips_at)}."
+    return f"{row.object} is first got wrong at epsilon {epsilon_text(row.flips_at)}."
 
 
-def plain_epsilon(value: EpsilonBudget) -> str:
+def epsilon_text(value: EpsilonBudget) -> str:
     """Return an epsilon, or those of several controls, as text; empty for None."""
     if isinstance(value, dict):
         return ",".join(
-            f"{name}={plain_epsilon(epsilon)}" for name, epsilon in value.items()
+            f"{name}={epsilon_text(epsilon)}" for name, epsilon in value.items()
         )
     return "" if value is None else words.number_text(value)
 

@@ -11,28 +11,28 @@ from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.candidates import FoundFailure
-from advsearch.attacks.trials import MOST_TIMES, MOVED, OVER_LADDER
+from advsearch.attacks.trials import MAX_MOVED_FRACTION, MAX_SAMPLE_RATIO, OVER_LADDER
 from advsearch.engine.journal import Journal
-from advsearch.engine.judging import domain_of, print_terms
+from advsearch.engine.judging import make_domain, measure_print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import (
-    Findings,
-    control_group,
-    lost_remarks,
+    RunState,
+    make_control_group,
+    make_lost_remarks,
+    make_verified_rate,
     mean_number,
-    verified_rate,
 )
-from advsearch.engine.transport import remark
+from advsearch.engine.transport import make_rendering_remark
 from advsearch.options import OUT_OF_VIEW, Value
 from advsearch.progress import Stages
 from advsearch.questions.attack.result import (
     AttackResult,
-    KeptPicture,
-    along_drive,
+    StoredImage,
+    choose_stored_trial,
+    evaluate_drive,
+    save_images,
     save_trial,
-    trial_to_show,
     write_object,
-    write_pictures,
 )
 from advsearch.questions.attack.stages import UNPRINTED
 from advsearch.questions.attack.summary import (
@@ -74,14 +74,14 @@ from advsearch.tasks import Judgement
 from advsearch.tasks.base import Task, mean
 from advsearch.tasks.detection import Detection
 from advsearch.trust.writing import write_bytes
-from advsearch.viewer.pages import keep_result
+from advsearch.viewer.pages import write_result
 
 T = TypeVar("T")
 MAX_LISTED_NUMBERS = 4096  # of a distribution, in a summary
 
 
 def make_result(
-    findings: Findings,
+    findings: RunState,
     journal: Journal,
     stages: Stages,
     warnings: Sequence[str],
@@ -117,17 +117,17 @@ def make_result(
     if search is not None:
         u = problem.domain.project(search.best_u)
     # After Ctrl-C no more images are rendered than needed.
-    trial = None if findings.interrupted else trial_to_show(findings)
-    clean = KeptPicture.of(problem, findings, problem.domain.start, trial)
-    adversarial = KeptPicture.of(problem, findings, u, trial)
-    artifacts = problem.searched_space.artifacts(u)
+    trial = None if findings.interrupted else choose_stored_trial(findings)
+    clean = StoredImage.render(problem, findings, problem.domain.start, trial)
+    adversarial = StoredImage.render(problem, findings, u, trial)
+    artifacts = problem.searched_space.get_artifact_images(u)
     if run is not None:
         images = {"clean": clean, "adversarial": adversarial}
         _write_files(run, problem, findings, u, images, artifacts)
     drive = None
     if not findings.interrupted:
         searched_u = None if search is None else u
-        drive = along_drive(problem, searched_u, findings.spp, run)
+        drive = evaluate_drive(problem, searched_u, findings.spp, run)
     summary = _summarize(
         findings,
         journal,
@@ -146,15 +146,15 @@ def make_result(
         python_only=python_only,
     )
     if run is not None:
-        keep_result(run, summary)
+        write_result(run, summary)
         if not findings.interrupted:
             run.store.forget()
     return AttackResult(
         summary,
         None if run is None else run.path,
         u,
-        clean.picture,
-        adversarial.picture,
+        clean.image,
+        adversarial.image,
         artifacts,
         search,
         in_memory=tuple(journal.rows),
@@ -164,9 +164,9 @@ def make_result(
 def _write_files(
     run: RunDirectory,
     problem: Problem,
-    findings: Findings,
+    findings: RunState,
     u: Tensor,
-    images: Mapping[str, KeptPicture],
+    images: Mapping[str, StoredImage],
     artifacts: Mapping[str, Tensor],
 ) -> None:
     """Write images, the object and the configuration into the run directory.
@@ -179,8 +179,8 @@ def _write_files(
         images: of both scenes.
         artifacts: images that the controls make of `u`.
     """
-    write_pictures(run, problem, findings, images)
-    for number, verification in enumerate(findings.failures):
+    save_images(run, problem, findings, images)
+    for number, verification in enumerate(findings.failure_verifications):
         trial = (f"failure {number}", 0)
         save_trial(
             run, problem, findings, trial, _failure_image(number), verification.u
@@ -190,16 +190,16 @@ def _write_files(
         run.save_image(name, image, folder="artifacts")
         run.save_exr(name, image, folder="artifacts")
     write_object(run, problem, u)
-    for name, data in problem.searched_space.files(u).items():
+    for name, data in problem.searched_space.get_artifact_files(u).items():
         write_bytes(run.path / "artifacts" / name, data)
     write_configuration(run.path, u.numpy())
 
 
 def _summarize(
-    findings: Findings,
+    findings: RunState,
     journal: Journal,
-    clean: KeptPicture,
-    adversarial: KeptPicture,
+    clean: StoredImage,
+    adversarial: StoredImage,
     **fields: Any,
 ) -> AttackSummary:
     """Return what `summary.json` holds.
@@ -230,13 +230,13 @@ def _summarize(
         norm=_unwrap_single(
             {control.name: control.budget.norm for control in controls}
         ),
-        label_set=list(task.truth_names(problem.truth())),
+        label_set=list(task.truth_names(problem.find_truth())),
         goal=task.goal,
         target=list(task.target_names) or None,
         over=[control.name for control in random_controls],
         conditions=_conditions(problem),
         image_formation=Formation.of(problem.renderer.formation),
-        gradient_plan=problem.plan_summary(problem.plan),
+        gradient_plan=problem.summarize_plan(problem.plan),
         light_path_segments=PathSegments(
             search=problem.search_depth or max_depth, verification=max_depth
         ),
@@ -245,28 +245,29 @@ def _summarize(
         adversarial=None
         if search is None
         else _prediction(adversarial.judgement, adversarial.trial),
-        verified=verification and verified_rate(verification),
+        verified=verification and make_verified_rate(verification),
         tried_objective=TriedObjective(
-            clean=_objective_over(findings.clean),
+            clean=_objective_over(findings.clean_trials),
             answer=_objective_over(
                 verification.adversarial_trials if verification else ()
             ),
         ),
         baseline=_baseline(problem, findings),
-        answer_from="random" if findings.beaten is not None else None,
-        policy_verified=findings.beaten and verified_rate(findings.beaten),
+        answer_from="random" if findings.outdone_verification is not None else None,
+        policy_verified=findings.outdone_verification
+        and make_verified_rate(findings.outdone_verification),
         ambient=_ambient_light(findings),
         average=_average_case(findings),
         smallest=_smallest_epsilon(problem, findings),
         distribution=None if search is None else _distribution(problem, search),
-        failures=described_failures(problem, findings),
+        failures=describe_failures(problem, findings),
         sample_count=findings.sample_count
         and VerificationSamples.of(findings.sample_count),
         transport=findings.transport_summary,
         claimed=None if search is None else _claim(search),
         gradients=None if search is None else _gradients(search),
         configuration=None if search is None else _found_values(problem, search.best_u),
-        shared=SharedWork.of_facts(journal.traced.facts, journal.machines),
+        shared=SharedWork.of_facts(journal.evaluator.worker_stats, journal.machines),
         renders=_renders(findings, problem),
         steps=0 if search is None else len(search.history),
         non_finite=NotFinite(
@@ -282,15 +283,15 @@ def _unwrap_single(values: dict[str, T]) -> T | dict[str, T]:
     return next(iter(values.values())) if len(values) == 1 else values
 
 
-def _ending(problem: Problem, findings: Findings) -> Ending:
+def _ending(problem: Problem, findings: RunState) -> Ending:
     """Return how the attack ended."""
     if findings.interrupted:
         return Ending.INTERRUPTED
     if findings.verification is not None:
         return findings.verification.ending
-    if findings.clean:
-        counts = count_right(findings.clean, findings.spp)
-        if problem.rule.already_wrong(counts):
+    if findings.clean_trials:
+        counts = count_right(findings.clean_trials, findings.spp)
+        if problem.rule.is_already_wrong(counts):
             return Ending.ALREADY_WRONG
     return Ending.INTERRUPTED
 
@@ -308,43 +309,43 @@ def _prediction(judgement: Judgement, trial: int | None) -> PicturedPrediction:
 
 
 def _clean_prediction(
-    problem: Problem, findings: Findings, picture: KeptPicture
+    problem: Problem, findings: RunState, picture: StoredImage
 ) -> CleanPrediction:
     """Return the prediction of the clean scene, with its trials if there are any."""
     control = None
-    if findings.clean:
-        control = control_group(findings.clean, findings.spp)
+    if findings.clean_trials:
+        control = make_control_group(findings.clean_trials, findings.spp)
     return CleanPrediction(
         **vars(_prediction(picture.judgement, picture.trial)),
         correct=picture.judgement.right,
-        moved=[MovedValue.of(value) for value in problem.space.moved],
+        moved=[MovedValue.of(value) for value in problem.space.adjusted_defaults],
         control=control,
     )
 
 
-def _baseline(problem: Problem, findings: Findings) -> BaselineSearch | None:
+def _baseline(problem: Problem, findings: RunState) -> BaselineSearch | None:
     """Return the random search; None if there was none."""
     if findings.baseline is None:
         return None
     verification = findings.baseline_verification
     return BaselineSearch(
         policy="random",
-        renders=findings.baseline.renders * problem.draws,
-        verified=verification and verified_rate(verification),
+        renders=findings.baseline.renders * problem.n_draws,
+        verified=verification and make_verified_rate(verification),
     )
 
 
-def _ambient_light(findings: Findings) -> AmbientLight | None:
+def _ambient_light(findings: RunState) -> AmbientLight | None:
     """Return in which ambient light the adversarial scene holds, if that was tried."""
-    if not findings.ambient:
+    if not findings.ambient_verifications:
         return None
     points = [
         AmbientPoint(
             lux=lux,
             holds=verification.ending is Ending.FOUND,
-            verified=verified_rate(verification),
+            verified=make_verified_rate(verification),
         )
-        for lux, verification in sorted(findings.ambient.items())
+        for lux, verification in sorted(findings.ambient_verifications.items())
     ]
     n_holding = 0
     while n_holding < len(points) and points[n_holding].holds:
@@ -357,17 +358,19 @@ def _ambient_light(findings: Findings) -> AmbientLight | None:
     )
 
 
-def _average_case(findings: Findings) -> AverageCase | None:
+def _average_case(findings: RunState) -> AverageCase | None:
     """Return the rate over random configurations, if there are any.
 
     Those without the object count only if there are no others.
     """
-    if not findings.average:
+    if not findings.random_trials:
         return None
     visible = [
-        trial for trial in findings.average if trial.prediction.label != OUT_OF_VIEW
+        trial
+        for trial in findings.random_trials
+        if trial.prediction.label != OUT_OF_VIEW
     ]
-    trials = visible or findings.average
+    trials = visible or findings.random_trials
     right = count_right(trials, findings.spp)
     scores = [trial.score for trial in trials]
     known_scores = [score for score in scores if not math.isnan(score)]
@@ -382,9 +385,9 @@ def _average_case(findings: Findings) -> AverageCase | None:
     )
 
 
-def _smallest_epsilon(problem: Problem, findings: Findings) -> SmallestEpsilon | None:
+def _smallest_epsilon(problem: Problem, findings: RunState) -> SmallestEpsilon | None:
     """Return the bracket of the smallest epsilon, by control; None if not searched."""
-    bracket = findings.smallest
+    bracket = findings.bracket
     if bracket is None:
         return None
 
@@ -397,7 +400,7 @@ def _smallest_epsilon(problem: Problem, findings: Findings) -> SmallestEpsilon |
     return SmallestEpsilon(
         epsilon=None if bracket.u is None else scale_budgets(bracket.high),
         not_found_at=scale_budgets(bracket.low) if bracket.low else None,
-        closed=bracket.closed,
+        closed=bracket.is_closed,
         confirmed=bracket.confirmed,
         searches=bracket.searches,
         checks=bracket.checks,
@@ -474,14 +477,14 @@ def _objective_over(trials: Sequence[Judgement]) -> ObjectiveValues | None:
     )
 
 
-def _printability(problem: Problem, findings: Findings) -> Printability:
+def _printability(problem: Problem, findings: RunState) -> Printability:
     """Return how printable the scenes are, and what that costs in margin."""
 
     def terms_of(search: SearchResult | None) -> PrintTerms | None:
         if search is None:
             return None
         u = problem.domain.project(search.best_u)
-        return print_terms(problem.searched_space, u)
+        return measure_print_terms(problem.searched_space, u)
 
     cost = None
     verification = findings.verification
@@ -489,8 +492,8 @@ def _printability(problem: Problem, findings: Findings) -> Printability:
     unprinted_verification = findings.unprinted_verification
     unprinted_terms = terms_of(unprinted)
     if verification and unprinted_verification and unprinted and unprinted_terms:
-        margin = verified_rate(verification).margin
-        unprinted_rate = verified_rate(unprinted_verification)
+        margin = make_verified_rate(verification).margin
+        unprinted_rate = make_verified_rate(unprinted_verification)
         cost = PrintCost(
             steps=len(unprinted.history),
             margin_with=margin,
@@ -499,7 +502,7 @@ def _printability(problem: Problem, findings: Findings) -> Printability:
             verified=unprinted_rate,
             terms=unprinted_terms,
         )
-    clean = print_terms(problem.searched_space, problem.domain.start)
+    clean = measure_print_terms(problem.searched_space, problem.domain.start)
     return Printability(clean=clean, answer=terms_of(findings.search), cost=cost)
 
 
@@ -561,9 +564,11 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
     ranges: dict[str, VariedValue] = {}
     if problem.conditions is None:
         return ranges
-    start = problem.whole(problem.domain.start)
-    domain = domain_of(problem.space.controls)
-    for group, (block, _) in zip(problem.space.groups, domain.parts(), strict=True):
+    start = problem.add_conditions(problem.domain.start)
+    domain = make_domain(problem.space.controls)
+    for group, (block, _) in zip(
+        problem.space.groups, domain.list_block_slices(), strict=True
+    ):
         is_random = group.begin >= len(problem.domain.start)
         if group.size != 1 or not is_random:
             continue
@@ -595,9 +600,9 @@ def _to_range(described: Sequence[Value], *, is_choice: bool) -> VariedValue:
     return VariedValue(unit=unit, names=names)
 
 
-def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
+def _renders(findings: RunState, problem: Problem) -> dict[str, int]:
     """Count the images that were rendered, by what for, and those predicted instead."""
-    transport = findings.transport
+    transport = findings.predictor
     counts = dict.fromkeys(
         ("search", "gradient", "baseline", "verification", "products"), 0
     )
@@ -612,9 +617,9 @@ def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
             continue
         n_predicted = 0
         if transport:
-            n_steps = transport.predicted(kind, len(search.history))
-            n_predicted = n_steps * problem.draws
-        n_rendered = search.renders * problem.draws - n_predicted
+            n_steps = transport.count_predicted(kind, len(search.history))
+            n_predicted = n_steps * problem.n_draws
+        n_rendered = search.renders * problem.n_draws - n_predicted
         n_gradients = max(0, search.gradients - n_predicted)
         counts["products"] += n_predicted
         if kind == UNPRINTED:
@@ -624,14 +629,14 @@ def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
             if kind == "search":
                 counts["gradient"] += n_gradients
     if transport:
-        counts["search"] += transport.traced
+        counts["search"] += transport.n_traced
     return counts
 
 
-def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str]:
+def _remarks(findings: RunState, problem: Problem, journal: Journal) -> list[str]:
     """Return what a reader of the result has to know."""
     remarks = list[str]()
-    rendering_remark = remark(findings.rendered_because)
+    rendering_remark = make_rendering_remark(findings.predictor_refusal)
     if rendering_remark:
         remarks.append(rendering_remark)
     samples = findings.sample_count
@@ -644,9 +649,9 @@ def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str
             )
         else:
             text += (
-                f" would leave the rate within {100 * MOVED:.0f} points. A check takes "
+                f" would leave the rate within {100 * MAX_MOVED_FRACTION:.0f} points. A check takes "
                 "no more than "
-                f"{OVER_LADDER[-1]}, and {MOST_TIMES} times the samples of the "
+                f"{OVER_LADDER[-1]}, and {MAX_SAMPLE_RATIO} times the samples of the "
                 "searches; `verify_spp` asks for more."
             )
         remarks.append(text)
@@ -662,35 +667,34 @@ def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str
             f"{n_non_finite} values of pictures or gradients were not finite "
             "and were set to 0."
         )
-    return [*remarks, *lost_remarks(journal.lost), *journal.remarks]
+    return [*remarks, *make_lost_remarks(journal.n_lost), *journal.remarks]
 
 
-def described_failures(
-    problem: Problem, findings: Findings
-) -> DifferentFailures | None:
+def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures | None:
     """Return the different failures of a policy that looks for them; else None."""
     known = findings.search.failures if findings.search else None
     if known is None:
         return None
-    n_verified = len(findings.failures)
+    n_verified = len(findings.failure_verifications)
     listed = [
         _describe_failure(
             problem,
             failure,
             number,
-            findings.failures[number] if number < n_verified else None,
+            findings.failure_verifications[number] if number < n_verified else None,
         )
-        for number, failure in enumerate(known.listed)
+        for number, failure in enumerate(known.examples)
     ]
     return DifferentFailures(
         over=[problem.domain.names[column] for column in known.over],
-        found=known.found,
-        seen=known.seen,
-        places=known.places,
-        share=known.share and FailingShare.of(known.share),
+        found=known.n_failures,
+        seen=known.n_visited,
+        places=known.n_cells,
+        share=known.failure_rate and FailingShare.of(known.failure_rate),
         tried=n_verified,
         held=sum(
-            verification.ending is Ending.FOUND for verification in findings.failures
+            verification.ending is Ending.FOUND
+            for verification in findings.failure_verifications
         ),
         listed=listed,
     )
@@ -730,7 +734,7 @@ def _describe_failure(
         configuration=configuration,
         objective=failure.objective,
         holds=verification.ending is Ending.FOUND,
-        verified=verified_rate(verification),
+        verified=make_verified_rate(verification),
         picture=f"images/{_failure_image(number)}.png",
         pictured=_prediction(verification.adversarial_trials[0], 0),
     )
@@ -746,7 +750,7 @@ def _ranges_of(
     """
     ranges: dict[str, tuple[float, float] | str] = {}
     for column, bounds in failure.ranges.items():
-        block = problem.domain.block_of(column)
+        block = problem.domain.find_block(column)
         values = list[Any]()
         for bound in bounds:
             u = failure.u.clone()

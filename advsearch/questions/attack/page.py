@@ -29,8 +29,13 @@ from advsearch.runs.results import (
     Result,
     VerifiedRate,
 )
-from advsearch.viewer.document import data_script, data_url
-from advsearch.viewer.pages import object_data, object_part, read_object, shown_page
+from advsearch.viewer.document import make_data_script, make_data_url
+from advsearch.viewer.pages import (
+    make_object_data,
+    make_object_part,
+    make_view_page,
+    read_object,
+)
 
 FRAME_QUALITY = 85  # of the JPEG frames of the search, from 1 to 95
 MAX_TRIAL_IMAGES = 24  # of the verification on a page
@@ -39,7 +44,7 @@ END_TOLERANCE = 1e-6
 MARKED = "-prediction.png"  # end of the names of files with marks
 
 
-def page(run: Path, result: Result) -> str | None:
+def make_page(run: Path, result: Result) -> str | None:
     """Return the page of an attack.
 
     None of a study, whose page is that of any result.
@@ -53,21 +58,21 @@ def page(run: Path, result: Result) -> str | None:
     """
     if not isinstance(result, AttackSummary):
         return None
-    view = display.shown(result)
+    view = display.make_attack_view(result)
     turned_object = read_object(run)
     frames = _read_frames(run / directory.IMAGES / "search.gif")
     objectives = _read_objectives(run)
     method_rows = [
-        [name, text] for name, text in wording.method_facts(result).items() if text
+        [name, text] for name, text in wording.method_texts(result).items() if text
     ]
     sections = [
         *_image_parts(run, result, animated=bool(frames)),
-        object_part(turned_object),
+        make_object_part(turned_object),
         _changes_part(result),
         _textures_part(run),
         *_failures_parts(result),
         _rates_part(result, view.sections[0]),
-        *display.ambient_part(result),
+        *display.make_ambient_parts(result),
         _search_part(result, objectives),
         ResultPart("How the search worked", rows=method_rows, folded=True),
         _plan_part(result.gradient_plan),
@@ -85,14 +90,14 @@ def page(run: Path, result: Result) -> str | None:
         result.environment,
         result.model,
     ]
-    data = object_data(turned_object)
+    data = make_object_data(turned_object)
     if frames:
         data = [_frames_data(frames, objectives.get("search", [])), *data]
     scripts = ["make.js", "attack.js"]
     if turned_object:
         scripts.append("object.js")
     view = replace(view, sections=sections, facts=facts, about=about)
-    return shown_page(run, result, view, data=data, scripts=scripts)
+    return make_view_page(run, result, view, data=data, scripts=scripts)
 
 
 def _read_objectives(run: Path) -> dict[str, list[float | None]]:
@@ -129,7 +134,7 @@ def _frames_data(frames: list[str], objectives: Sequence[float | None]) -> Html:
         objectives[step] if step < len(objectives) else None for step in steps
     ]
     data = {"pictures": frames, "steps": steps, "objectives": frame_objectives}
-    return data_script(data, "frames")
+    return make_data_script(data, "frames")
 
 
 def _image_parts(
@@ -297,10 +302,10 @@ def _failures_parts(summary: AttackSummary) -> Iterator[ResultPart]:
         name = ""
         if failure.pictured:
             name = words.prediction_text(summary.task, failure.pictured)
-        name = name or display.most_predicted(failure)
+        name = name or display.most_frequent_label(failure)
         pictures.append(Picture(failure.picture, display.range_text(failure), name))
     yield replace(
-        display.failures_part(known),
+        display.make_failures_part(known),
         title="Different failures",
         text=[f"Failures are {display.failures_text(known)}."],
         pictures=[pictures] if pictures else [],
@@ -360,7 +365,7 @@ def _search_part(
         ranges.append(f"{name}: from {known[0]:.3g} to {max(known):.3g}")
     zero_means = ""
     if summary.objective in words.SUCCESS_ABOVE_ZERO:
-        above = "right" if summary.minimises else wording.success(summary)
+        above = "right" if summary.minimises else wording.success_name(summary)
         zero_means = f"above: {above}"
     label = words.objective_label(summary.objective)
     return ResultPart(
@@ -413,7 +418,7 @@ def _read_frames(file: Path) -> list[str]:
             for frame in ImageSequence.Iterator(animation):
                 stream = io.BytesIO()
                 frame.convert("RGB").save(stream, "JPEG", quality=FRAME_QUALITY)
-                frames.append(data_url(stream.getvalue(), "image/jpeg"))
+                frames.append(make_data_url(stream.getvalue(), "image/jpeg"))
     except files.BAD_PICTURE:
         return []
     return frames if len(frames) > 1 else []

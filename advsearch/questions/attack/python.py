@@ -10,30 +10,30 @@ from typing import TYPE_CHECKING, Any, Literal
 from torch import Tensor
 
 from advsearch import losses
-from advsearch.api.keywords import Names, SceneKeywords, asks
+from advsearch.api.keywords import Names, SceneKeywords, with_settings_signature
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.config import SceneConfig
 from advsearch.engine import judging, loading, naming
 from advsearch.engine.judging import Metric
 from advsearch.engine.loading import Controls, Scene
-from advsearch.engine.naming import AnyModel, model_name, several
+from advsearch.engine.naming import AnyModel, get_model_name, list_models
 from advsearch.errors import InputError
-from advsearch.options import as_setting, told
+from advsearch.options import describe_value, to_setting
 from advsearch.progress import Watched, watcher
 from advsearch.questions.attack.carry_out import (
     AttackParts,
-    controls_given,
     is_named,
-    models_as_one,
-    task_and_objective,
+    load_ensemble,
+    make_attack_controls,
+    make_task_and_objective,
 )
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.run import run_attack
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import begun, is_run, run_path
 from advsearch.settings import PythonOnly
-from advsearch.tasks import AnyTask, OwnTask, Task, make_task
+from advsearch.tasks import AnyTask, FunctionTask, Task, make_task
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -60,7 +60,7 @@ class AttackKeywords(SceneKeywords, total=False):
     trials: int | None
 
 
-@asks(AttackConfig)
+@with_settings_signature(AttackConfig)
 def attack(
     scene: Scene | str | Path | Mapping[str, object],
     model: AnyModel | Sequence[AnyModel] = "reference",
@@ -117,51 +117,54 @@ def attack(
     if not isinstance(policy, (str, Mapping, Policy)) or not policy:
         raise InputError(
             "policy: expected a name, a mapping with a `name` and options, or an "
-            f"instance, got {told(policy)}"
+            f"instance, got {describe_value(policy)}"
         )
-    session_controls = [*loading.only_here(controls), *loading.only_here(over)]
+    session_controls = [
+        *loading.list_session_only_controls(controls),
+        *loading.list_session_only_controls(over),
+    ]
     are_named = all(
-        isinstance(value, (str, Path)) for value in (scene, *several(model))
+        isinstance(value, (str, Path)) for value in (scene, *list_models(model))
     )
     if (
         not are_named
         or callable(objective)
         or session_controls
-        or isinstance(task, OwnTask)
+        or isinstance(task, FunctionTask)
     ):
-        naming.check_not_spread(options)
+        naming.check_no_worker_settings(options)
     scene = _load_scene(scene, object, options)
 
     # What `run.yaml` states. Objects of the caller have the names that they are shown
     # by.
     objective_name = _name_objective(objective) if callable(objective) else objective
     described = {
-        **loading.scene_as_settings(scene),
-        "model": ",".join(map(model_name, several(model))),
-        "controls": loading.settings_of(controls),
-        "over": loading.settings_of(over),
-        "task": as_setting(task) if isinstance(task, Task) else task,
+        **loading.scene_to_settings(scene),
+        "model": ",".join(map(get_model_name, list_models(model))),
+        "controls": loading.controls_to_settings(controls),
+        "over": loading.controls_to_settings(over),
+        "task": to_setting(task) if isinstance(task, Task) else task,
         "objective": objective_name,
-        "policy": as_setting(policy) if isinstance(policy, Policy) else policy,
-        "metrics": judging.metrics_as_settings(metrics or {}),
+        "policy": to_setting(policy) if isinstance(policy, Policy) else policy,
+        "metrics": judging.metrics_to_settings(metrics or {}),
     }
     if options.get("exposure"):  # the option says it
         described["set"].pop("camera.exposure", None)
     config = AttackConfig(
         **{**described, **options, "run": None if run is None else str(run)}
     )
-    losses.check_aim(objective, targeted=config.target is not None)
+    losses.check_direction(objective, targeted=config.target is not None)
 
     python_only = _find_python_only(
         config, scene, model, task, objective, policy, session_controls
     )
-    config = config.with_only_here(python_only)
+    config = config.with_python_only_parts(python_only)
     _check_single(config)
 
-    searched, random_controls = controls_given(config, controls, over)
+    searched, random_controls = make_attack_controls(config, controls, over)
     if not isinstance(policy, Policy):
         policy = make_policy(config.policy_name, **config.policy_options)
-    loaded_task, objective = task_and_objective(
+    loaded_task, objective = make_task_and_objective(
         config,
         task if isinstance(task, Task) else config.task,
         objective if callable(objective) else config.objective,
@@ -176,13 +179,13 @@ def attack(
         parts = AttackParts(
             config,
             scene,
-            loaded=models_as_one(model, config, loaded_task),
+            model_and_warnings=load_ensemble(model, config, loaded_task),
             task=loaded_task,
             controls=searched,
-            over=random_controls,
+            random_controls=random_controls,
             objective=objective,
             policy=policy,
-            keep=run is not None,
+            is_stored=run is not None,
             metrics=judging.load_metrics(config.metrics, metrics),
         )
         return run_attack(parts, watcher(progress), directory)
@@ -209,11 +212,11 @@ def _find_python_only(
         session_controls: names of the controls that exist in this session only.
     """
     parts = [
-        PythonOnly("model", model_name(network))
-        for network in several(model)
-        if naming.exists_here(network)
+        PythonOnly("model", get_model_name(network))
+        for network in list_models(model)
+        if naming.is_session_only(network)
     ]
-    if scene.only_here:
+    if scene.is_session_only:
         parts.append(PythonOnly("scene"))
     if isinstance(task, Task) and not is_named(task, make_task):
         parts.append(PythonOnly("task", task.name))
@@ -222,7 +225,10 @@ def _find_python_only(
     if isinstance(policy, Policy) and not is_named(policy, _make_policy):
         parts.append(PythonOnly("policy", policy.name))
     parts += [PythonOnly("control", name) for name in session_controls]
-    parts += [PythonOnly("metric", name) for name in judging.only_here(config.metrics)]
+    parts += [
+        PythonOnly("metric", name)
+        for name in judging.list_session_only_metrics(config.metrics)
+    ]
     return parts
 
 
@@ -239,12 +245,14 @@ def _load_scene(
         options: of the attack.
     """
     if isinstance(scene, Scene):
-        naming.check_not_of_scene({**options, "object": shape})
+        naming.check_no_scene_settings({**options, "object": shape})
         return scene
-    scene_options = {name: options[name] for name in naming.OF_SCENE if name in options}
+    scene_options = {
+        name: options[name] for name in naming.SCENE_SETTINGS if name in options
+    }
     config = SceneConfig(**{"object": "mug", **scene_options})
     environment = config.environment
-    keywords = naming.told_of_scene(config)
+    keywords = naming.make_scene_kwargs(config)
     if shape is not None:
         return loading.load_scene(shape, environment, scene=scene, **keywords)
     if isinstance(scene, Mapping):
@@ -272,7 +280,7 @@ def _check_single(config: AttackConfig) -> None:
             that workers can load.
     """
     if config.workers is not None or config.cluster is not None:
-        judging.check_shared(config.metrics)
+        judging.check_metrics_importable(config.metrics)
     if config.is_matrix and config.ensemble is None:
         raise InputError(
             "model: expected one, got several; add `ensemble`, which attacks them "

@@ -22,11 +22,11 @@ from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult
 from advsearch.controls.base import Control
 from advsearch.controls.ranges import OneOf
-from advsearch.engine.judging import task_for
+from advsearch.engine.judging import make_ensemble_task
 from advsearch.engine.loading import Scene, load_scene
-from advsearch.engine.naming import AnyModel, in_turn
+from advsearch.engine.naming import AnyModel, hold_process_lock
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import KEPT, Findings
+from advsearch.engine.record import MAX_STORED_IMAGES, RunState
 from advsearch.engine.rendering import Rendering, render
 from advsearch.errors import InputError
 from advsearch.questions.attack.summary import AlongDrive, AttackSummary
@@ -34,14 +34,14 @@ from advsearch.report.figures import marked, new_axes, search_axes
 from advsearch.report.views import result_html, shown, side_by_side
 from advsearch.runs import files, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
-from advsearch.scene.assembly import posed
-from advsearch.scene.assets import Shape, simpler
-from advsearch.scene.color import to_8_bit
+from advsearch.scene.assembly import pose_mesh
+from advsearch.scene.assets import Shape, make_simplifier
+from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.description import OBJECT
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.glb import web_glb
-from advsearch.scene.settings import Given
-from advsearch.settings import as_python
+from advsearch.scene.glb import encode_web_glb
+from advsearch.scene.settings import SettingValues
+from advsearch.settings import to_python
 from advsearch.tasks import Judgement, Mark
 from advsearch.trust.code import names_code
 from advsearch.trust.writing import write_bytes
@@ -83,12 +83,14 @@ def _resolve_scene(scene: Scene | str | Path | None, default: Scene) -> Scene:
     return scene if isinstance(scene, Scene) else load_scene(scene)
 
 
-def _change_view(scene: Scene, camera: str | None, settings: Given | None) -> Scene:
+def _change_view(
+    scene: Scene, camera: str | None, settings: SettingValues | None
+) -> Scene:
     """Return a scene with other settings, and with the view of one of its cameras."""
     if settings:
         scene = scene.with_settings(settings)
     if camera:
-        scene = replace(scene, description=scene.description.seen_by(camera))
+        scene = replace(scene, description=scene.description.with_camera(camera))
     return scene
 
 
@@ -166,14 +168,14 @@ class AttackResult:
         return [row.objective for row in rows if row.objective is not None]
 
     @names_code
-    @in_turn()
+    @hold_process_lock()
     def render(
         self,
         model: AnyModel | None = None,
         *,
         scene: Scene | str | Path | None = None,
         camera: str | Mapping[str, float] | None = None,
-        settings: Given | None = None,
+        settings: SettingValues | None = None,
         **options: Unpack[RenderKeywords],
     ) -> Rendering:
         """Render the adversarial scene again, and return what a model predicts of it.
@@ -204,8 +206,8 @@ class AttackResult:
             )
         _check_render_keywords(options)
         parts = self.parts()
-        camera = as_python(camera)
-        settings = as_python(settings)
+        camera = to_python(camera)
+        settings = to_python(settings)
         if isinstance(camera, Mapping):
             camera_settings = {
                 f"camera.{name}": value for name, value in camera.items()
@@ -218,11 +220,13 @@ class AttackResult:
                 "settings: the adversarial configuration says what "
                 f"{min(clashes)} is; leave it out"
             )
-        attacked_model = parts.loaded[0]
+        attacked_model = parts.model_and_warnings[0]
         return render(
             _change_view(_resolve_scene(scene, parts.scene), camera, settings),
             attacked_model if model is None else model,
-            task=task_for(parts.task, attacked_model) if model is None else parts.task,
+            task=make_ensemble_task(parts.task, attacked_model)
+            if model is None
+            else parts.task,
             label=parts.config.label,
             controls=parts.controls,
             at=self.u,
@@ -291,27 +295,27 @@ UNTRIED_SPP = 16
 
 
 @dataclass(frozen=True, eq=False)
-class KeptPicture:
+class StoredImage:
     """An image of a configuration that is stored, as the model gets it.
 
     Attributes:
-        whole: the configuration of the full space.
+        full_configuration: the configuration of the full space.
         radiance: (H, W, 3) linear.
-        picture: (H, W, 3) sRGB, 8-bit values in [0, 1].
+        image: (H, W, 3) sRGB, 8-bit values in [0, 1].
         judgement: of the image.
         trial: whose image it is; None if there were no trials.
     """
 
-    whole: Tensor
+    full_configuration: Tensor
     radiance: Tensor
-    picture: Tensor
+    image: Tensor
     judgement: Judgement
     trial: int | None
 
     @classmethod
-    def of(
-        cls, problem: Problem, findings: Findings, u: Tensor, trial: int | None
-    ) -> KeptPicture:
+    def render(
+        cls, problem: Problem, findings: RunState, u: Tensor, trial: int | None
+    ) -> StoredImage:
         """Render a configuration as in a trial.
 
         Args:
@@ -322,20 +326,20 @@ class KeptPicture:
         """
         if trial is None:
             seed = seeds.stream(problem.seed, "pictures")
-            whole = problem.whole(u, None)
+            whole = problem.add_conditions(u, None)
             spp = UNTRIED_SPP
         else:
             seed = seeds.stream(problem.seed, "verification", trial)
-            whole = problem.whole(u, seed)
+            whole = problem.add_conditions(u, seed)
             spp = findings.spp
         with torch.no_grad():
             radiance = problem.renderer.radiance(whole, seed, spp)
             display = problem.renderer.formation.display(radiance)
-            picture = to_8_bit(problem.space.picture(whole, display))
+            picture = round_to_8_bit(problem.space.apply_to_image(whole, display))
         return cls(whole, radiance, picture, problem.judge(picture, whole), trial)
 
 
-def trial_to_show(findings: Findings) -> int | None:
+def choose_stored_trial(findings: RunState) -> int | None:
     """Return the trial whose images of both scenes are stored.
 
     Both scenes have the same conditions in it. It is the first with the most frequent
@@ -345,11 +349,11 @@ def trial_to_show(findings: Findings) -> int | None:
     """
     verification = findings.verification
     if verification is None:
-        clean_labels = _labels(findings.clean)
+        clean_labels = _labels(findings.clean_trials)
         return clean_labels.index(mode(clean_labels)) if clean_labels else None
     clean_labels = _labels(verification.clean_trials)
-    has_successes = bool(verification.successes)
-    usual = mode(_labels(verification.successes or verification.counting))
+    has_successes = bool(verification.successful_trials)
+    usual = mode(_labels(verification.successful_trials or verification.valid_trials))
     usual_clean = mode(clean_labels)
     ranks = []
     for label, outcome, clean_label in zip(
@@ -361,18 +365,18 @@ def trial_to_show(findings: Findings) -> int | None:
         is_usual = label == usual
         is_counted = is_usual and outcome is has_successes
         ranks.append((is_counted, is_usual, clean_label == usual_clean))
-    return verification.begin + ranks.index(max(ranks))
+    return verification.first_index + ranks.index(max(ranks))
 
 
 def _labels(trials: Sequence[Judgement]) -> list[str]:
     return [trial.prediction.label for trial in trials]
 
 
-def write_pictures(
+def save_images(
     run: RunDirectory,
     problem: Problem,
-    findings: Findings,
-    scene_images: Mapping[str, KeptPicture],
+    findings: RunState,
+    scene_images: Mapping[str, StoredImage],
 ) -> None:
     """Save the images of an attack: of both scenes, of trials, and of the search.
 
@@ -385,14 +389,18 @@ def write_pictures(
     for name, image in scene_images.items():
         _save_scene_image(run, problem, name, image)
     difference = files.difference(
-        scene_images["clean"].picture, scene_images["adversarial"].picture
+        scene_images["clean"].image, scene_images["adversarial"].image
     )
     run.save_image("difference", difference)
     verification = findings.verification
-    kind = "verification" if findings.beaten is None else "baseline verification"
+    kind = (
+        "verification"
+        if findings.outdone_verification is None
+        else "baseline verification"
+    )
     if verification is not None:
-        end = verification.begin + len(verification.adversarial_trials)
-        for number in range(verification.begin, end)[:KEPT]:
+        end = verification.first_index + len(verification.adversarial_trials)
+        for number in range(verification.first_index, end)[:MAX_STORED_IMAGES]:
             save_trial(
                 run,
                 problem,
@@ -402,33 +410,33 @@ def write_pictures(
                 verification.u,
             )
     if findings.frames:
-        last_frame = scene_images["adversarial"].picture
+        last_frame = scene_images["adversarial"].image
         if problem.conditions is not None and findings.search is not None:
             # The other frames have the conditions as the scene comes.
             u = problem.domain.project(findings.search.best_u)
-            last_frame = KeptPicture.of(problem, findings, u, None).picture
+            last_frame = StoredImage.render(problem, findings, u, None).image
         run.save_animation("search", [*findings.frames, last_frame.numpy()])
 
 
 def _save_scene_image(
-    run: RunDirectory, problem: Problem, name: str, image: KeptPicture
+    run: RunDirectory, problem: Problem, name: str, image: StoredImage
 ) -> None:
     """Save the image of a scene, its radiance, its marks and its layers."""
-    run.save_image(name, image.picture)
+    run.save_image(name, image.image)
     run.save_exr(name, image.radiance * problem.renderer.formation.gain)
-    marks = problem.marks(image.picture, image.whole)
-    save_marked(run, name, image.picture, marks)
+    marks = problem.find_marks(image.image, image.full_configuration)
+    save_with_marks(run, name, image.image, marks)
     if problem.aovs:
-        surfaces = problem.renderer.surfaces(image.whole)
-        layers = surfaces.layers(problem.aovs, OBJECT)
-        notes = surfaces.notes(problem.aovs)
+        surfaces = problem.renderer.surfaces(image.full_configuration)
+        layers = surfaces.make_layers(problem.aovs, OBJECT)
+        notes = surfaces.describe_layers(problem.aovs)
         files.write_layers(run.path / IMAGES / f"{name}.aov.exr", layers, notes)
 
 
 def save_trial(
     run: RunDirectory,
     problem: Problem,
-    findings: Findings,
+    findings: RunState,
     trial: tuple[str, int],
     name: str,
     u: Tensor,
@@ -444,14 +452,16 @@ def save_trial(
         u: (d,) the configuration.
     """
     seed = seeds.stream(problem.seed, "verification", trial[1])
-    image = findings.pictures.get(trial)
+    image = findings.trial_images.get(trial)
     if image is None:
         image = problem.picture(u, seed, findings.spp)
     run.save_image(name, image)
-    save_marked(run, name, image, problem.marks(image, problem.whole(u, seed)))
+    save_with_marks(
+        run, name, image, problem.find_marks(image, problem.add_conditions(u, seed))
+    )
 
 
-def save_marked(
+def save_with_marks(
     run: RunDirectory, name: str, picture: Tensor, marks: list[Mark]
 ) -> None:
     """Save an image with the marks of a task, if there are any."""
@@ -478,11 +488,11 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     meshes = [mesh for name, mesh in scene.meshes.items() if name in changed_names]
     max_faces = MAX_FACES // len(meshes)
     # None if a mesh has few faces already
-    simplify = {part.name: simpler(part.mesh, max_faces) for part in meshes}
+    simplify = {part.name: make_simplifier(part.mesh, max_faces) for part in meshes}
 
     def make_shapes(inputs: Mapping[str, Tensor]) -> list[Shape]:
         """Return the shapes near the object, with fewer faces."""
-        shapes = {part.name: posed(part, inputs) for part in meshes}
+        shapes = {part.name: pose_mesh(part, inputs) for part in meshes}
         near_shapes = []
         for shape in _select_near(shapes):
             simplify_shape = simplify[shape.name]
@@ -504,14 +514,14 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     note = ""
     if simplified:
         note = f"It is shown with fewer faces than it has ({', '.join(simplified)})."
-    glb = web_glb(make_shapes(adversarial), make_shapes(clean), to_world, note)
+    glb = encode_web_glb(make_shapes(adversarial), make_shapes(clean), to_world, note)
     write_bytes(run.path / OBJECT_FILE, glb)
 
 
 def _assemble(problem: Problem, u: Tensor) -> Mapping[str, Tensor]:
     """Return what the scene takes for a configuration (d,)."""
     with torch.no_grad():
-        inputs = problem.space.inputs(problem.whole(u))
+        inputs = problem.space.inputs(problem.add_conditions(u))
         return problem.renderer.scene.assembly(inputs)
 
 
@@ -533,7 +543,7 @@ STRIP_HEIGHT = 160  # pixels
 MIN_FRAME_MILLISECONDS = 40
 
 
-def along_drive(
+def evaluate_drive(
     problem: Problem, u: Tensor | None, spp: int, run: RunDirectory | None
 ) -> AlongDrive | None:
     """Evaluate both scenes at evenly spaced times of each path that varies by chance.
@@ -564,7 +574,7 @@ def along_drive(
         frames[:, : len(configuration)] = configuration
         images, right_counts[name] = _render_frames(problem, frames, spp)
         if run is not None:
-            write_drive(run, name, images, total_seconds)
+            save_drive(run, name, images, total_seconds)
     return AlongDrive(
         frames=len(frames),
         seconds=seconds,
@@ -584,7 +594,8 @@ def _find_path(problem: Problem) -> tuple[Any, int]:
     column = len(problem.domain.start)
     for control in problem.space.controls[n_searched:]:
         has_random_time = any(
-            slot.parameter.name == "time" and slot.width for slot in control.slots
+            slot.parameter.name == "time" and slot.n_coordinates
+            for slot in control.slots
         )
         if control.travels and has_random_time:
             return control, column
@@ -605,8 +616,12 @@ def _make_frames(
     Returns:
         Names, none of a single path; and (paths * FRAMES, d) of the full space.
     """
-    start = problem.whole(problem.domain.start)
-    specs = [slot.spec for slot in path.slots if slot.parameter.name == Control.WAY]
+    start = problem.add_conditions(problem.domain.start)
+    specs = [
+        slot.spec
+        for slot in path.slots
+        if slot.parameter.name == Control.PATH_PARAMETER
+    ]
     # A path with a weight comes several times.
     choices = next((spec.values for spec in specs if isinstance(spec, OneOf)), ())
     names = list(dict.fromkeys(choices))
@@ -634,14 +649,14 @@ def _render_frames(
     for number, configuration in enumerate(frames):
         seed = seeds.stream(problem.seed, "drive", number)
         with torch.no_grad():
-            image = to_8_bit(problem.renderer(configuration, seed=seed, spp=spp))
-        is_right, marks = problem.seen(image, configuration)
+            image = round_to_8_bit(problem.renderer(configuration, seed=seed, spp=spp))
+        is_right, marks = problem.predict_with_marks(image, configuration)
         n_right += is_right
         images.append(np.asarray(marked(image.numpy(), marks), dtype=np.float32))
     return images, n_right
 
 
-def write_drive(
+def save_drive(
     run: RunDirectory,
     name: str,
     images: Sequence[npt.NDArray[np.float32]],
@@ -670,13 +685,13 @@ def write_drive(
     write_bytes(run.path / IMAGES / f"{name}.webp", stream.getvalue())
     width = max(1, round(frames[0].width * STRIP_HEIGHT / frames[0].height))
     strip = []
-    for number in evenly(len(frames), MAX_STRIP_FRAMES):
+    for number in select_evenly(len(frames), MAX_STRIP_FRAMES):
         small = frames[number].resize((width, STRIP_HEIGHT), Image.Resampling.LANCZOS)
         strip.append(np.asarray(small, dtype=np.float32) / 255.0)
     run.save_image(name, np.concatenate(strip, axis=1))
 
 
-def evenly(count: int, max_count: int) -> npt.NDArray[np.int64]:
+def select_evenly(count: int, max_count: int) -> npt.NDArray[np.int64]:
     """Return indices of evenly spaced frames, the first and the last among them.
 
     Args:

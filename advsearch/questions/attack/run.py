@@ -15,17 +15,17 @@ from typing import Any
 
 from advsearch import seeds
 from advsearch.attacks import Policy, make_policy
-from advsearch.attacks.candidates import scaled
+from advsearch.attacks.candidates import scale_domain
 from advsearch.attacks.policies import WithoutAscent
 from advsearch.attacks.trials import LADDER
 from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
-from advsearch.controls.base import sentences
-from advsearch.engine.journal import Journal, Shared, check_made_of
+from advsearch.controls.base import describe_adjusted_defaults
+from advsearch.engine.journal import Journal, ParallelEvaluator, check_digests
 from advsearch.engine.loading import Scene
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings
+from advsearch.engine.record import RunState
 from advsearch.engine.transport import CleanMatrix
-from advsearch.engine.verifier import Verifier, ladder_of
+from advsearch.engine.verifier import Verifier, choose_ladder
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.models import Model, RemoteNetwork
@@ -33,9 +33,9 @@ from advsearch.progress import NullProgress, Progress, Stages
 from advsearch.questions.attack.carry_out import (
     LOADING,
     AttackParts,
-    executor_for,
-    parts_of,
-    problem_on,
+    load_parts,
+    make_problem,
+    open_executor,
 )
 from advsearch.questions.attack.outcome import make_result
 from advsearch.questions.attack.result import AttackResult
@@ -45,15 +45,15 @@ from advsearch.questions.attack.stages import (
     Measure,
     Searches,
     choose_predictor,
+    evaluate_clean_scene,
     find_smallest,
     is_already_wrong,
-    look_at_clean_scene,
     plan_renders,
     verify_searches,
 )
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory, check_free
-from advsearch.tasks import function_of
+from advsearch.tasks import get_task_function
 
 PREPARING = "preparing the scene for rendering"
 WORKER = "advsearch.questions.attack.carry_out:attack_worker"
@@ -79,14 +79,14 @@ def attack_once(
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
     progress.stage(LOADING)
-    parts = parts_of(config)
-    parts.clean = clean or parts.clean
+    parts = load_parts(config)
+    parts.clean_matrix = clean or parts.clean_matrix
     return run_attack(parts, progress, resumed)
 
 
 def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
     """Attack a scene and a model that are loaded already; nothing is stored."""
-    return run_attack(parts_of(config, scene, model), NullProgress())
+    return run_attack(load_parts(config, scene, model), NullProgress())
 
 
 def run_attack(
@@ -103,35 +103,35 @@ def run_attack(
         InputError: parts do not fit together, or the run that is continued has others.
     """
     config = parts.config
-    model, loading_notes = parts.loaded
+    model, loading_notes = parts.model_and_warnings
     with ExitStack() as stack:
         run = None
         if resumed is not None:
             run = stack.enter_context(RunDirectory.of(config, resumed))
         stages = Stages(progress)
         stages.begin("setup", PREPARING)
-        problem = problem_on(parts)
+        problem = make_problem(parts)
         warnings = [
-            *problem.space.notes(parts.scene.description),
+            *problem.space.list_notes(parts.scene.description),
             *loading_notes,
-            *sentences(problem.space.moved),
+            *describe_adjusted_defaults(problem.space.adjusted_defaults),
         ]
         for text in warnings:
             progress.message(text)
         policy = choose_policy(parts.policy, problem, _gradient_setting(config))
-        if run is None and parts.keep:
+        if run is None and parts.is_stored:
             run = stack.enter_context(RunDirectory.of(config))
         if run is not None:
-            check_made_of(run, [model], functions_of(parts))
-        with executor_for(config, WORKER, progress) as executor:
+            check_digests(run, [model], find_user_functions(parts))
+        with open_executor(config, WORKER, progress) as executor:
             # replays stored rows, renders and stores the others
-            journal = Journal(run, Shared(problem, executor))
+            journal = Journal(run, ParallelEvaluator(problem, executor))
             is_size_chosen = config.steps is None or config.draws is None
             if problem.conditions is not None and is_size_chosen:
                 progress.message(
                     "One configuration for many conditions: "
                     f"{count(problem.steps, 'step')}, each over "
-                    f"{count(problem.draws, 'condition')}; `steps` and `draws` change "
+                    f"{count(problem.n_draws, 'condition')}; `steps` and `draws` change "
                     "that."
                 )
             has_trial_count = config.trials is not None or config.smallest
@@ -139,22 +139,22 @@ def run_attack(
                 policy,
                 journal,
                 stages,
-                clean=parts.clean,
+                clean=parts.clean_matrix,
                 smallest=config.smallest,
                 seconds=config.seconds,
                 baseline=config.baseline,
                 printable=config.printable,
-                close_looks=config.close_looks,
+                close_looks=config.max_extra_repeats,
                 average=config.average,
                 trials=config.trial_count if has_trial_count else None,
-                ladder=ladder_of(config.verify_spp, config.pixel_sampler),
+                ladder=choose_ladder(config.verify_spp, config.pixel_sampler),
                 specialise=config.specialise,
                 measure=config.measure,
                 deterministic=config.deterministic,
                 chooses_spp=config.spp is None,
             )
         if isinstance(problem.model.module, RemoteNetwork):
-            warnings.append(problem.model.module.sentence)
+            warnings.append(problem.model.module.spending_sentence)
         result = make_result(
             findings,
             journal,
@@ -171,7 +171,7 @@ def run_attack(
             python_only=config.python_only,
         )
         # without the matrix of light transport, which may be large
-        stored_parts = replace(parts, clean=CleanMatrix())
+        stored_parts = replace(parts, clean_matrix=CleanMatrix())
         return replace(result, parts=lambda: stored_parts)
 
 
@@ -193,7 +193,7 @@ def search_and_verify(
     measure: Measure = "quick",
     deterministic: bool = False,
     chooses_spp: bool = False,
-) -> Findings:
+) -> RunState:
     """Search a problem with a policy and at random, and verify what was found.
 
     Ctrl-C ends it with what there is.
@@ -224,7 +224,7 @@ def search_and_verify(
     problem = journal.problem
     first_spp = problem.spp  # a preparation may choose another one for the search
     looks = TRIAL_LOOKS if problem.conditions is None else OVER_LOOKS
-    findings = Findings()
+    findings = RunState()
     verifier = Verifier(
         journal, ladder, stages, findings, looks if trials is None else (trials,)
     )
@@ -233,7 +233,7 @@ def search_and_verify(
     )
     if smallest:
         # raises for what has no budget, before anything is rendered
-        scaled(problem.domain, 1.0)
+        scale_domain(problem.domain, 1.0)
     try:
         with interruptible():
             plan_renders(
@@ -245,9 +245,9 @@ def search_and_verify(
                 deterministic=deterministic,
                 chooses_spp=chooses_spp,
             )
-            findings.first_look = look_at_clean_scene(journal, stages, first_spp)
+            findings.first_look = evaluate_clean_scene(journal, stages, first_spp)
             if not is_already_wrong(verifier, in_any_case=smallest):
-                findings.transport = choose_predictor(
+                findings.predictor = choose_predictor(
                     policy,
                     journal,
                     stages,
@@ -263,7 +263,7 @@ def search_and_verify(
                     )
                 verify_searches(verifier, is_smallest=smallest)
             if average:
-                verifier.average(average)
+                verifier.try_random(average)
     except KeyboardInterrupt:
         findings.interrupted = True
     stages.end()
@@ -364,12 +364,12 @@ def _gradient_setting(config: AttackConfig) -> str | None:
     return "measure" if config.measure == "full" else None
 
 
-def functions_of(parts: AttackParts) -> dict[str, Callable[..., Any] | None]:
+def find_user_functions(parts: AttackParts) -> dict[str, Callable[..., Any] | None]:
     """Return the caller's functions by their use; a continued run needs the same."""
     functions: dict[str, Callable[..., Any] | None] = {
         f"metric {name}": metric for name, metric in parts.metrics.items()
     }
     if callable(parts.objective):
         functions["objective"] = parts.objective
-    functions["task"] = function_of(parts.task)
+    functions["task"] = get_task_function(parts.task)
     return functions

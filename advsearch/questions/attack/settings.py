@@ -12,7 +12,7 @@ from advsearch.config import (
     DerivativeConfig,
     RenderConfig,
     SceneConfig,
-    name_in,
+    get_name,
     read_named,
 )
 from advsearch.files import JsonObject
@@ -23,16 +23,16 @@ from advsearch.trust import powers
 TRIALS = 20
 TRIALS_OVER = 200
 STEPS = 40  # Of a search about one picture
-OVER_PREDICTED = (300, 8)
-OVER_ONE = (100, 4)
-OVER_RENDERED = (150, 4)
-OVER_NUMBERS = (STEPS, 4)
+SIZE_OVER_PREDICTED = (300, 8)
+SIZE_OVER_ONE_NUMBER = (100, 4)
+SIZE_OVER_RENDERED = (150, 4)
+SIZE_OVER_NUMBERS = (STEPS, 4)
 """Steps of a search for many conditions, and conditions that each evaluates: if a bank
 of light transport predicts images; if, besides, conditions are a single number
 (docs/drives.md); if each image is rendered; and if, besides, only a few numbers are
 searched (a pose).
 """
-FEWEST_TRIALS = 6
+MIN_TRIALS = 6
 """With fewer trials nothing can be called found: `attacks.verification.Rule.fewest`,
 which a test compares.
 """
@@ -42,7 +42,7 @@ class AttackConfig(DerivativeConfig):
     """The settings of `attack`. Frozen; unknown names are rejected."""
 
     command: ClassVar[str] = "attack"
-    several: ClassVar[tuple[str, ...]] = ("object", "epsilon", "model")
+    list_settings: ClassVar[tuple[str, ...]] = ("object", "epsilon", "model")
 
     free: ClassVar[tuple[str, ...]] = (
         *DerivativeConfig.free,
@@ -109,7 +109,8 @@ class AttackConfig(DerivativeConfig):
         Clash(
             "over",
             lambda config: (
-                {*map(instance, config.over)} & {*map(instance, config.controls)}
+                {*map(parse_instance, config.over)}
+                & {*map(parse_instance, config.controls)}
             ),
             "names a control that is searched already; leave it out of one of the two",
         ),
@@ -125,7 +126,7 @@ class AttackConfig(DerivativeConfig):
                 {name.partition(".")[0] for name in config.estimators}
                 & {
                     part
-                    for name in map(instance, config.over)
+                    for name in map(parse_instance, config.over)
                     for part in (name, name.rpartition(":")[2])
                 }
             ),
@@ -176,10 +177,10 @@ class AttackConfig(DerivativeConfig):
         None,
         "search",
         "number of search steps, each of which evaluates one configuration",
-        otherwise=f"{STEPS}; for textures and the like with --over {OVER_PREDICTED[0]} "
+        otherwise=f"{STEPS}; for textures and the like with --over {SIZE_OVER_PREDICTED[0]} "
         "where pictures are predicted, "
-        f"{OVER_ONE[0]} where one number varies, as along a path, and "
-        f"{OVER_RENDERED[0]} where they are rendered",
+        f"{SIZE_OVER_ONE_NUMBER[0]} where one number varies, as along a path, and "
+        f"{SIZE_OVER_RENDERED[0]} where they are rendered",
         ge=1,
         le=1_000_000,
     )
@@ -286,9 +287,9 @@ class AttackConfig(DerivativeConfig):
         None,
         "search",
         "how many random conditions each step looks at, with --over",
-        otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted and more than one "
+        otherwise=f"{SIZE_OVER_PREDICTED[1]} where pictures are predicted and more than one "
         "number varies, otherwise "
-        f"{OVER_RENDERED[1]}",
+        f"{SIZE_OVER_RENDERED[1]}",
         ge=1,
         le=1000,
     )
@@ -323,13 +324,13 @@ class AttackConfig(DerivativeConfig):
         "verification",
         "fresh renders that verify the adversarial scene, and as "
         "many of the clean scene",
-        f"a whole number from {FEWEST_TRIALS} to 100000 (with fewer, nothing can be "
+        f"a whole number from {MIN_TRIALS} to 100000 (with fewer, nothing can be "
         "called found)",
         otherwise=f"14, or 23 where one fails; with --over 30, or up to {TRIALS_OVER} "
         f"where some fail; {TRIALS} with "
         "--smallest",
         unit="renders",
-        ge=FEWEST_TRIALS,
+        ge=MIN_TRIALS,
         le=100_000,
     )
 
@@ -371,7 +372,7 @@ class AttackConfig(DerivativeConfig):
     @property
     def policy_name(self) -> str:
         """Name of the policy."""
-        return name_in(self.policy)
+        return get_name(self.policy)
 
     @property
     def policy_options(self) -> JsonObject:
@@ -405,7 +406,7 @@ class AttackConfig(DerivativeConfig):
         return TRIALS_OVER if self.over else TRIALS
 
 
-def instance(asked: str) -> str:
+def parse_instance(asked: str) -> str:
     """Return the instance in the name of a parameter.
 
     `light:key` for itself, `camera` for `camera.azimuth`.

@@ -19,8 +19,8 @@ from advsearch.attacks import (
     SearchResult,
     StepRecord,
     Verification,
+    count_planned_renders,
     count_right,
-    planned_renders,
     run_trials,
     search,
 )
@@ -28,25 +28,25 @@ from advsearch.attacks.candidates import (
     ATTEMPTS,
     MOST_CHECKS,
     ROUNDS,
-    confirmed,
-    smallest,
+    confirm_bracket,
+    find_smallest_change,
 )
 from advsearch.attacks.evaluation import Query
 from advsearch.engine import surface_light
 from advsearch.engine.bank import Bank
 from advsearch.engine.gradients import planning
-from advsearch.engine.gradients.bench import Bench, interior_point
-from advsearch.engine.journal import PLAN, Journal
-from advsearch.engine.judging import penalised
+from advsearch.engine.gradients.bench import Bench, find_interior_point
+from advsearch.engine.journal import PLAN_NOTE, Journal
+from advsearch.engine.judging import subtract_print_penalty
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings
+from advsearch.engine.record import RunState
 from advsearch.engine.surface_light import SurfaceLight
 from advsearch.engine.transport import (
     CleanMatrix,
     PredictedSearch,
     Transport,
-    refusal_of_matrices,
-    remark,
+    find_matrix_refusal,
+    make_rendering_remark,
 )
 from advsearch.engine.verifier import Verifier
 from advsearch.progress import Stages
@@ -61,7 +61,7 @@ UNPRINTED = "search without print terms"
 """The kind of the search without print terms: compared with one that has them, it
 measures what they cost.
 """
-FIRST_LOOK = 4
+N_FIRST_LOOKS = 4
 """Renders of the clean configuration before the search; wrong in all of them, it goes
 through the full trials first.
 """
@@ -97,21 +97,21 @@ def plan_renders(
         chooses_spp: whether a full measurement may choose the samples per pixel.
     """
     problem = journal.problem
-    stored = journal.note(PLAN)
+    stored = journal.get_note(PLAN_NOTE)
     if stored is not None:
-        problem.plan = problem.plan.restored(stored["plan"])
+        problem.plan = problem.plan.restore(stored["plan"])
         problem.spp = stored["spp"]
         problem.search_depth = stored["search_depth"]
         return
     is_full = measure == "full"
-    if specialise and (is_full or problem.steps >= planning.WORTH_BOUNCES):
-        refusal = surface_light.refusal_of_surface_light(
+    if specialise and (is_full or problem.steps >= planning.MIN_RENDERS_FOR_BOUNCES):
+        refusal = surface_light.find_surface_light_refusal(
             problem, problem.steps, policy, specialise
         )
         if refusal is not None:  # else no step will be rendered
             _choose_bounces(problem, stages)
     if policy.uses_gradient and measure != "no":
-        refusal = refusal_of_matrices(problem, problem.steps, specialise)
+        refusal = find_matrix_refusal(problem, problem.steps, specialise)
         # Without a refusal, derivatives come from what predicts the images.
         if is_full or refusal is not None:
             _measure_gradients(
@@ -126,7 +126,7 @@ def plan_renders(
         "spp": problem.spp,
         "search_depth": problem.search_depth,
     }
-    journal.set_note(PLAN, choice)
+    journal.set_note(PLAN_NOTE, choice)
 
 
 def _choose_bounces(problem: Problem, stages: Stages) -> None:
@@ -134,12 +134,12 @@ def _choose_bounces(problem: Problem, stages: Stages) -> None:
     stages.begin(
         "setup",
         "finding how many bounces of light the search needs",
-        planning.most_pictures(problem),
+        planning.count_bounce_images(problem),
         hint="few samples each; `specialise=false` leaves it out",
         at_most=True,
     )
     tick = stages.progress.advance
-    bounces = planning.bounces_of(problem, problem.seed, tick=tick)
+    bounces = planning.measure_problem_bounces(problem, problem.seed, tick=tick)
     problem.search_depth = bounces.depth
 
 
@@ -158,13 +158,13 @@ def _measure_gradients(
     seed = seeds.stream(problem.seed, "measure")
     bench = Bench(
         renderer,
-        problem.loss,
-        interior_point(renderer),
+        problem.compute_loss,
+        find_interior_point(renderer),
         seed,
         problem.spp,
         tick=lambda samples: progress.advance(1),
     )
-    gradients = planning.plan_gradients(renderer.plan, every=full)
+    gradients = planning.count_plan_gradients(renderer.plan, with_all=full)
     if gradients:
         hint = (
             f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; "
@@ -173,9 +173,11 @@ def _measure_gradients(
         stages.begin(
             "setup", "measuring which gradients are best here", gradients, hint=hint
         )
-    problem.plan = planning.measured_plan(bench, every=full, counted=counted)
+    problem.plan = planning.choose_estimators(
+        bench, with_all=full, count_renders=counted
+    )
     if full:
-        samples = planning.cosine_samples(problem.plan)
+        samples = planning.count_cosine_samples(problem.plan)
         hint = "counted in samples a pixel; `measure=quick` leaves it out"
         stages.begin(
             "setup",
@@ -184,13 +186,13 @@ def _measure_gradients(
             hint=hint,
             at_most=True,
         )
-        table = list(planning.cosines(replace(bench, tick=progress.advance)))
-        problem.plan, spp = planning.tuned(problem.plan, table)
+        table = list(planning.measure_cosines(replace(bench, tick=progress.advance)))
+        problem.plan, spp = planning.choose_steps(problem.plan, table)
         if chooses_spp and spp is not None:
             problem.spp = spp
 
 
-def look_at_clean_scene(
+def evaluate_clean_scene(
     journal: Journal, stages: Stages, spp: int
 ) -> tuple[Judgement, ...]:
     """Render the clean configuration a few times, and return the judgements."""
@@ -198,7 +200,7 @@ def look_at_clean_scene(
     seed = seeds.stream(problem.seed, "first look")
     start = problem.domain.start
     hint = "the first picture compiles the renderer's code"
-    stages.begin("setup", "looking at the clean scene", FIRST_LOOK, hint=hint)
+    stages.begin("setup", "looking at the clean scene", N_FIRST_LOOKS, hint=hint)
 
     def evaluate(query: Query) -> Evaluation:
         evaluation = problem.evaluate(query)
@@ -206,7 +208,7 @@ def look_at_clean_scene(
         return evaluation
 
     return run_trials(
-        partial(map, evaluate), start, spp=spp, seed=seed, trials=FIRST_LOOK
+        partial(map, evaluate), start, spp=spp, seed=seed, trials=N_FIRST_LOOKS
     )
 
 
@@ -217,21 +219,25 @@ def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     `in_any_case`.
     """
     problem = verifier.problem
-    findings = verifier.findings
+    findings = verifier.state
     looks_right = any(trial.right for trial in findings.first_look)
-    if not problem.rule.control or (looks_right and not in_any_case):
+    if not problem.rule.has_control or (looks_right and not in_any_case):
         return False
     verifier.choose_spp({"clean": problem.domain.start})
-    verifier.begin("checking the clean scene with fresh renders", verifier.looks[0])
+    verifier.begin_stage(
+        "checking the clean scene with fresh renders", verifier.looks[0]
+    )
     verifier.try_clean()
-    return problem.rule.already_wrong(count_right(findings.clean, findings.spp))
+    return problem.rule.is_already_wrong(
+        count_right(findings.clean_trials, findings.spp)
+    )
 
 
 def choose_predictor(
     policy: Policy[Any],
     journal: Journal,
     stages: Stages,
-    findings: Findings,
+    findings: RunState,
     *,
     specialise: bool,
     clean: CleanMatrix,
@@ -243,17 +249,19 @@ def choose_predictor(
     """
     problem = journal.problem
     steps = problem.steps
-    matrix = refusal_of_matrices(problem, steps, specialise)
-    surface = surface_light.refusal_of_surface_light(problem, steps, policy, specialise)
+    matrix = find_matrix_refusal(problem, steps, specialise)
+    surface = surface_light.find_surface_light_refusal(
+        problem, steps, policy, specialise
+    )
 
     candidates: list[Callable[[], PredictedSearch]] = []  # cheapest first
     if matrix is None and problem.conditions is None:
-        candidates.append(lambda: Transport(problem, steps, clean=clean))
+        candidates.append(lambda: Transport(problem, steps, clean_matrix=clean))
     else:
         if surface is None:
             candidates.append(lambda: SurfaceLight(problem, steps))
         if matrix is None:
-            candidates.append(lambda: Bank(problem, steps, journal.traced))
+            candidates.append(lambda: Bank(problem, steps, journal.evaluator))
 
     for make_predictor in candidates:
         predictor = make_predictor()
@@ -263,14 +271,14 @@ def choose_predictor(
         if refusal.cause is RefusalCause.TOO_LARGE:
             _report_rendering(refusal, stages, findings)
             return None
-        surface = findings.surface_refused = refusal
+        surface = findings.surface_light_refusal = refusal
         instead = "rendered" if matrix else "predicted by matrices"
         stages.progress.message(f"Pictures are {instead}: {refusal}.")
 
     assert matrix is not None and surface is not None
     is_too_short = (
-        not findings.surface_refused
-        and refusal_of_matrices(problem, None, specialise) is None
+        not findings.surface_light_refusal
+        and find_matrix_refusal(problem, None, specialise) is None
     )
     is_about_matrices = is_too_short or surface.cause is RefusalCause.NO_CAMERA
     _report_rendering(matrix if is_about_matrices else surface, stages, findings)
@@ -287,18 +295,18 @@ def _prepare(predictor: PredictedSearch, stages: Stages) -> Refusal | None:
         "from here on the search renders nothing (counted in samples a pixel); "
         "`specialise=false` leaves it out"
     )
-    stages.begin("transport", title, predictor.samples, hint=hint)
+    stages.begin("transport", title, predictor.n_samples, hint=hint)
     try:
         predictor.prepare(stages.progress.advance)
     except TransportTooLargeError as error:
         return Refusal(str(error), RefusalCause.TOO_LARGE)
-    return predictor.too_far_off
+    return predictor.accuracy_refusal
 
 
-def _report_rendering(refusal: Refusal, stages: Stages, findings: Findings) -> None:
+def _report_rendering(refusal: Refusal, stages: Stages, findings: RunState) -> None:
     """Report and store why images are rendered."""
-    findings.rendered_because = refusal
-    text = remark(refusal)
+    findings.predictor_refusal = refusal
+    text = make_rendering_remark(refusal)
     if text:
         stages.progress.message(text)
 
@@ -317,7 +325,7 @@ class Searches:
 
     journal: Journal
     stages: Stages
-    findings: Findings
+    findings: RunState
     printable: bool = False
     close_looks: int = 0
 
@@ -334,10 +342,10 @@ class Searches:
             steps: of the search.
             shorter: which settings shorten it.
         """
-        n_renders = planned_renders(steps, close=self.close_looks)
+        n_renders = count_planned_renders(steps, max_extra_repeats=self.close_looks)
         samples = count(self.problem.spp, "sample")
         hint = f"{n_renders} pictures of {samples} a pixel; {shorter}"
-        if self.findings.transport is not None:
+        if self.findings.predictor is not None:
             n_traced = n_renders - steps
             hint = f"{steps} pictures predicted and {n_traced} traced; {shorter}"
         self.stages.begin(name, title, n_renders, hint=hint, at_most=True)
@@ -372,7 +380,7 @@ class Searches:
         """
         renders_before = 0
         frame_interval = max(1, math.ceil(steps / MAX_FRAMES))
-        transport = self.findings.transport
+        transport = self.findings.predictor
 
         def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
             nonlocal renders_before
@@ -380,7 +388,7 @@ class Searches:
                 frames.append(evaluation.picture.numpy())
             new_renders = record.renders - renders_before
             self.stages.progress.advance(
-                new_renders, best=record.best, **self.journal.traced.told
+                new_renders, best=record.best, **self.journal.evaluator.progress_stats
             )
             renders_before = record.renders
 
@@ -389,22 +397,22 @@ class Searches:
                 queries = [
                     replace(
                         query,
-                        keep=query.phase == "search"
+                        with_image=query.phase == "search"
                         and query.number % frame_interval == 0,
                     )
                     for query in queries
                 ]
-            on_replay = (lambda query: None) if transport is None else transport.passed
+            on_replay = (lambda query: None) if transport is None else transport.replay
             return self.journal.evaluate_all(queries, self._evaluate, on_replay)
 
         domain = domain or self.problem.domain
         if transport is None:
-            domain = replace(domain, exact=False, drawn=False)
+            domain = replace(domain, exact=False, draws_conditions=False)
         else:
             domain = replace(
                 domain,
-                exact=transport.exact,
-                drawn=transport.drawn and policy.uses_gradient,
+                exact=transport.is_exact,
+                draws_conditions=transport.draws_conditions and policy.uses_gradient,
             )
         result = search(
             evaluate,
@@ -413,11 +421,11 @@ class Searches:
             steps=steps,
             seed=seed,
             candidates=4 if ranked else 0,
-            close=self.close_looks,
-            late=self.journal.clock(kind, seconds),
+            max_extra_repeats=self.close_looks,
+            is_out_of_time=self.journal.make_time_check(kind, seconds),
             on_step=on_step,
             kind=kind,
-            noise=self.problem.seed,
+            render_seed=self.problem.seed,
         )
         if result.ending is Ending.INTERRUPTED:
             self.findings.search = self.findings.search or result
@@ -429,8 +437,8 @@ class Searches:
 
         Print terms are subtracted from the objective.
         """
-        traced = self.journal.traced
-        predictor = self.findings.transport
+        traced = self.journal.evaluator
+        predictor = self.findings.predictor
         if predictor is None or not queries or queries[0].phase != "search":
             evaluations = traced(queries)
         else:
@@ -438,7 +446,7 @@ class Searches:
         for query, evaluation in zip(queries, evaluations, strict=True):
             has_print_terms = self.printable and query.kind != UNPRINTED
             yield (
-                penalised(evaluation, self.problem.searched_space, query.u)
+                subtract_print_penalty(evaluation, self.problem.searched_space, query.u)
                 if has_print_terms
                 else evaluation
             )
@@ -452,7 +460,7 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     smallest change lies at the decision, where no sample count settles the margin: it
     is tried with that of the clean configuration, as on the way to it.
     """
-    findings = verifier.findings
+    findings = verifier.state
     problem = verifier.problem
     candidate = findings.search
     baseline = findings.baseline
@@ -465,33 +473,33 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     ]
     if not is_smallest or findings.sample_count is None:
         n_images = sum(
-            (result.renders + result.gradients) * problem.draws for result in results
+            (result.renders + result.gradients) * problem.n_draws for result in results
         )
         configurations = {"adversarial": adversarial, "clean": problem.domain.start}
-        verifier.choose_spp(configurations, searched=n_images * problem.spp)
-    n_groups = len(results) + (not verifier.clean_tried)
-    verifier.begin(
+        verifier.choose_spp(configurations, search_samples=n_images * problem.spp)
+    n_groups = len(results) + (not verifier.has_clean_trials)
+    verifier.begin_stage(
         "checking what was found with fresh renders",
-        n_groups * verifier.count,
+        n_groups * verifier.n_trials,
         at_most=True,
     )
     verifier.try_clean()
-    findings.verification = verifier.verified("verification", candidate)
+    findings.verification = verifier.verify("verification", candidate)
     if findings.verification.ending is Ending.ALREADY_WRONG:
         # seen with other samples than before: no change at all flips the prediction
-        findings.smallest = None
+        findings.bracket = None
     if unprinted is not None:
-        findings.unprinted_verification = verifier.verified(
+        findings.unprinted_verification = verifier.verify(
             "unprinted verification", unprinted
         )
     if baseline is not None:
         is_found = findings.verification.ending is Ending.FOUND
-        findings.baseline_verification = verifier.verified(
+        findings.baseline_verification = verifier.verify(
             "baseline verification", baseline, curtailed=is_found
         )
         _replace_if_random_is_worse(verifier, candidate, baseline)
     if not is_smallest:
-        check_failures(verifier, candidate)
+        verify_failures(verifier, candidate)
     if findings.verification.ending is Ending.FOUND:
         find_ambient(verifier, findings.verification.u)
 
@@ -504,7 +512,7 @@ def _replace_if_random_is_worse(
     It is chosen by its trials, so these are no evidence: it has to be worse in fresh
     ones, too.
     """
-    findings = verifier.findings
+    findings = verifier.state
     policy_verification = findings.verification
     random = findings.baseline_verification
     if (
@@ -516,11 +524,11 @@ def _replace_if_random_is_worse(
     if _rank(random) <= _rank(policy_verification):
         return
     title = "checking what the random search found again"
-    verifier.begin(title, 2 * verifier.count, at_most=True)
-    random = verifier.verified("baseline verification", baseline, again=True)
+    verifier.begin_stage(title, 2 * verifier.n_trials, at_most=True)
+    random = verifier.verify("baseline verification", baseline, with_new_trials=True)
     findings.baseline_verification = random
     if _rank(random) > _rank(policy_verification):
-        findings.beaten = policy_verification
+        findings.outdone_verification = policy_verification
         findings.verification = random
         findings.search = replace(
             result,
@@ -551,11 +559,11 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
     """
     problem = searches.problem
     findings = searches.findings
-    n_trials = verifier.count
+    n_trials = verifier.n_trials
     results: list[SearchResult] = []
     transport = None
-    if isinstance(findings.transport, Transport):
-        transport = findings.transport
+    if isinstance(findings.predictor, Transport):
+        transport = findings.predictor
 
     def search_inside(domain: Domain, number: int) -> Tensor:
         title = f"search {number + 1} of at most {ROUNDS}"
@@ -571,45 +579,47 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         results.append(result)
         # what was found if this is interrupted
         findings.search = findings.search or results[0]
-        verifier.begin("trying smaller changes", MOST_CHECKS * n_trials, at_most=True)
+        verifier.begin_stage(
+            "trying smaller changes", MOST_CHECKS * n_trials, at_most=True
+        )
         return result.best_u
 
     def passes(u: Tensor, check: int, min_trials: int = n_trials) -> bool:
         """Return whether a configuration (d,) passes a check, as many as it needs."""
-        max_failures = problem.rule.allowed(n_trials)
+        max_failures = problem.rule.count_allowed_failures(n_trials)
         scores = list[float]()
         n_failures = 0
         while len(scores) < n_trials and n_failures <= max_failures:
             if not n_failures and len(scores) >= min_trials:
                 break
-            (trial,) = verifier.trials(f"check {check}", {len(scores): u})
+            (trial,) = verifier.try_configurations(f"check {check}", {len(scores): u})
             scores.append(trial.score)
             n_failures += not trial.success
         if transport is not None:
-            transport.correct(u, scores)
+            transport.update_score_bias(u, scores)
         has_passed = n_failures <= max_failures
         if has_passed:
             findings.search = replace(results[-1], best_u=u)
         return has_passed
 
     def passes_few(u: Tensor, check: int) -> bool:
-        return passes(u, check, problem.rule.fewest)
+        return passes(u, check, problem.rule.min_trials)
 
-    bracket = smallest(
+    bracket = find_smallest_change(
         search_inside,
         passes_few,
         problem.domain,
-        likely=None if transport is None else transport.likely,
+        likely=None if transport is None else transport.is_likely_success,
     )
     n_repeats = math.ceil(MIN_CONFIRMING_TRIALS / n_trials)
     if bracket.u is not None:
-        verifier.begin(
+        verifier.begin_stage(
             "checking the smallest change",
             ATTEMPTS * n_repeats * n_trials,
             at_most=True,
         )
-    bracket = confirmed(bracket, passes, problem.domain, times=n_repeats)
-    findings.smallest = bracket
+    bracket = confirm_bracket(bracket, passes, problem.domain, times=n_repeats)
+    findings.bracket = bracket
     winner = results[0]
     if bracket.u is not None:
         winner = replace(
@@ -624,11 +634,11 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
 
 def _rank(verification: Verification) -> tuple[bool, float, float]:
     """Return how bad a verified configuration is for the model; larger is worse."""
-    scores = [trial.score for trial in verification.counting]
+    scores = [trial.score for trial in verification.valid_trials]
     mean_score = sum(scores) / len(scores)
     return (
         verification.ending is Ending.FOUND,
-        verification.adversarial.rate,
+        verification.adversarial_counts.rate,
         -math.inf if math.isnan(mean_score) else mean_score,
     )
 
@@ -636,7 +646,7 @@ def _rank(verification: Verification) -> tuple[bool, float, float]:
 MAX_TRIED_FAILURES = 8  # the first of the list
 
 
-def check_failures(verifier: Verifier, result: SearchResult) -> None:
+def verify_failures(verifier: Verifier, result: SearchResult) -> None:
     """Verify the first of the different failures that a search found, each by itself.
 
     This takes the trials of the adversarial configuration, with the seeds that the
@@ -648,21 +658,21 @@ def check_failures(verifier: Verifier, result: SearchResult) -> None:
         result: of the search.
     """
     problem = verifier.problem
-    findings = verifier.findings
+    findings = verifier.state
     known = result.failures
     rule = problem.rule
-    if known is None or not known.listed or rule.conditional:
+    if known is None or not known.examples or rule.is_conditional:
         return
-    if rule.already_wrong(count_right(findings.clean, 1)):
+    if rule.is_already_wrong(count_right(findings.clean_trials, 1)):
         return
-    failures = known.listed[:MAX_TRIED_FAILURES]
-    verifier.begin(
+    failures = known.examples[:MAX_TRIED_FAILURES]
+    verifier.begin_stage(
         "checking different failures with fresh renders",
-        len(failures) * verifier.count,
+        len(failures) * verifier.n_trials,
         at_most=True,
     )
-    findings.failures = tuple(
-        verifier.verified(
+    findings.failure_verifications = tuple(
+        verifier.verify(
             f"failure {number}", replace(result, best_u=failure.u), curtailed=True
         )
         for number, failure in enumerate(failures)

@@ -21,23 +21,23 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cluster import Call, WorkerTask
+from advsearch.cluster import BatchFunction, WorkerTask
 from advsearch.cluster.workers import open_workers
-from advsearch.engine.journal import worker_call
-from advsearch.engine.judging import one_label_for_several
-from advsearch.engine.naming import different, load_models
+from advsearch.engine.journal import make_worker_call
+from advsearch.engine.judging import find_label_warnings
+from advsearch.engine.naming import check_distinct, load_models
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import control_group, verified_rate
+from advsearch.engine.record import make_control_group, make_verified_rate
 from advsearch.engine.transport import CleanMatrix
 from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.errors import ClusterError, FileFormatError
-from advsearch.experiment import Made, RunContext, run_part
+from advsearch.experiment import ResultType, RunContext, run_part
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
 from advsearch.questions.attack.carry_out import (
     LOADING,
     check_from_config,
-    executor_for,
+    open_executor,
     problem_from_config,
 )
 from advsearch.questions.attack.run import attack_once
@@ -76,20 +76,20 @@ class StudyAttack:
     Attributes:
         config: its settings.
         name: of its directory.
-        of: the object or the model that tells it from the others.
+        subject: the object or the model that tells it from the others.
         epsilon: of a curve; None otherwise.
     """
 
     config: AttackConfig
     name: str
-    of: str
+    subject: str
     epsilon: float | None = None
 
 
 Chain = list[StudyAttack]  # attacks in order, until one of them settles the object
 
 
-def chains_of(config: AttackConfig) -> list[Chain]:
+def make_chains(config: AttackConfig) -> list[Chain]:
     """Return the attacks of a study: of a matrix or a curve.
 
     Raises:
@@ -100,13 +100,13 @@ def chains_of(config: AttackConfig) -> list[Chain]:
 
 def _matrix_chains(config: AttackConfig) -> list[Chain]:
     """Return an attack for each model, or the one on the ensemble."""
-    names: Sequence[str] = different(config.models, "model")
+    names: Sequence[str] = check_distinct(config.models, "model")
     if config.ensemble:
         names = [ALL]
     chains: list[Chain] = []
     for index, name in enumerate(names):
         changes = {} if config.ensemble else {"model": name}
-        attack_config = AttackConfig.of(config, **changes)
+        attack_config = AttackConfig.from_config(config, **changes)
         directory = f"{index:02d}-" + default_name(name, [])
         chains.append([StudyAttack(attack_config, directory, name)])
     return chains
@@ -117,13 +117,13 @@ def _curve_chains(config: AttackConfig) -> list[Chain]:
     # None: each control has its own epsilon
     epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
     chains: list[Chain] = []
-    for index, name in enumerate(different(config.objects, "object")):
+    for index, name in enumerate(check_distinct(config.objects, "object")):
         chain: Chain = []
         for epsilon in epsilons:
             words = []
             if epsilon is not None:
                 words = [f"epsilon {epsilon:g}".replace(".", "_")]
-            attack_config = AttackConfig.of(
+            attack_config = AttackConfig.from_config(
                 config,
                 object=name,
                 epsilon=config.epsilon if epsilon is None else epsilon,
@@ -134,7 +134,7 @@ def _curve_chains(config: AttackConfig) -> list[Chain]:
     return chains
 
 
-def attacks_of(settings: JsonObject) -> Call:
+def attacks_of(settings: JsonObject) -> BatchFunction:
     """Return the function by which a worker makes attacks of a study.
 
     It takes the index of a chain, and returns of each attack the name of its directory,
@@ -143,7 +143,7 @@ def attacks_of(settings: JsonObject) -> Call:
     Args:
         settings: of the study.
     """
-    chains = chains_of(AttackConfig(**settings))
+    chains = make_chains(AttackConfig(**settings))
 
     def call(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
         finished = []
@@ -172,7 +172,7 @@ def _read_files(directory: Path) -> dict[str, bytes]:
     }
 
 
-def share(
+def distribute_attacks(
     config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Progress
 ) -> None:
     """Have workers make the attacks of a study that have not begun, if requested.
@@ -194,7 +194,7 @@ def share(
     in_process = {"workers": None, "cluster": None}
     work = WorkerTask(
         "advsearch.questions.attack.studies:attacks_of",
-        config.to_repeat().model_copy(update=in_process).plain(),
+        config.make_repeatable().model_copy(update=in_process).to_json(),
         FILES,
         config.used_threads or 1,
         seconds=MAX_ATTACK_SECONDS,
@@ -208,7 +208,7 @@ def share(
         if executor is None:
             return
         progress.stage("attacks on workers", len(missing))
-        for done in executor.results([index] for index in missing):
+        for done in executor.compute([index] for index in missing):
             if done.lost:
                 lost_attack = chains[done.items[0]][0]
                 title = lost_attack.config.object
@@ -219,7 +219,7 @@ def share(
                 )
             for name, worker_path, files in done.value:
                 _write_part(run, name, worker_path, files)
-            facts = executor.facts
+            facts = executor.stats
             values = {} if facts is None else {"workers": facts.workers}
             progress.advance(1, **values)
 
@@ -266,17 +266,17 @@ class StudyRun:
         self.warnings = _find_label_warnings(config)
         for text in self.warnings:
             self.progress.message(text)
-        self.chains = chains_of(config)
+        self.chains = make_chains(config)
         self.names: list[str] = []
         with context.until_interrupted():
-            share(config, self.chains, self.run.path, self.progress)
+            distribute_attacks(config, self.chains, self.run.path, self.progress)
 
     @property
     def interrupted(self) -> bool:
         """Whether the study was interrupted."""
         return self.context.ending == INTERRUPTED
 
-    def attack(
+    def run_attack(
         self, study: StudyAttack, clean: CleanMatrix | None = None
     ) -> AttackSummary | None:
         """Make an attack, or read its result.
@@ -321,7 +321,7 @@ class StudyRun:
             return None
         return summary
 
-    def result(self, kind: type[Made], **fields: Any) -> Made:
+    def make_result(self, kind: type[ResultType], **fields: Any) -> ResultType:
         """Return the result of the study.
 
         Args:
@@ -343,7 +343,7 @@ def _find_label_warnings(config: AttackConfig) -> list[str]:
         for name in config.objects
     }
     models, _ = load_models([config.model], make_task(config.task), config)
-    return one_label_for_several(models, config.label, labels)
+    return find_label_warnings(models, config.label, labels)
 
 
 def curve(context: RunContext[AttackConfig]) -> CurveResult:
@@ -358,22 +358,22 @@ def curve(context: RunContext[AttackConfig]) -> CurveResult:
     rows = [_attack_object(study, chain) for chain in study.chains]
     epsilons: list[float | None] = [*sorted(context.config.epsilons)] or [None]
     points = [_compute_accuracy(rows, epsilon) for epsilon in epsilons]
-    return study.result(CurveResult, epsilons=epsilons, table=rows, curve=points)
+    return study.make_result(CurveResult, epsilons=epsilons, table=rows, curve=points)
 
 
 def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
     """Attack an object with growing epsilons, until one of them settles it."""
-    row = ObjectRow(object=chain[0].of, clean=None, flips_at=None)
+    row = ObjectRow(object=chain[0].subject, clean=None, flips_at=None)
     clean = CleanMatrix()
     renders: Counter[str] = Counter()
     for attack in chain:
-        summary = study.attack(attack, clean)
+        summary = study.run_attack(attack, clean)
         if summary is None:
             break
         renders.update(summary.renders)
         epsilon = summary.epsilon if attack.epsilon is None else attack.epsilon
         row = ObjectRow(
-            object=attack.of,
+            object=attack.subject,
             clean=summary.clean.control,
             ending=summary.ending,
             epsilon=epsilon,
@@ -403,7 +403,7 @@ def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
         return True
     if row.clean is None:
         return False
-    min_correct = WORST_CASE.needed(row.clean.trials)
+    min_correct = WORST_CASE.count_needed(row.clean.trials)
     if row.clean.correct < min_correct:
         return False
     return epsilon is None or (row.tried is not None and row.tried >= epsilon)
@@ -446,13 +446,13 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
     on the clean scene with the same seed, as everywhere.
     """
     config = context.config
-    names = different(config.models, "model")
+    names = check_distinct(config.models, "model")
     context.progress.stage(LOADING)
     for name in names:
         check_from_config(_with_model(config, name))
 
     study = StudyRun(context)
-    summaries = {attack.of: study.attack(attack) for (attack,) in study.chains}
+    summaries = {attack.subject: study.run_attack(attack) for (attack,) in study.chains}
     attacked = {
         name: summary for name, summary in summaries.items() if summary is not None
     }
@@ -478,7 +478,7 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
         )
         for name, summary in attacked.items()
     ]
-    return study.result(
+    return study.make_result(
         MatrixResult,
         models=list(names),
         ensemble=config.ensemble,
@@ -523,7 +523,7 @@ def _try_on_models(
         resolution = problem.renderer.formation.resolution
         conditions.append(RetrialCondition(name, problem, spp, resolution))
     worker = "advsearch.questions.attack.studies:models_worker"
-    with executor_for(config, worker, study.progress) as executor:
+    with open_executor(config, worker, study.progress) as executor:
         retrials = Retrials(
             conditions,
             study.run,
@@ -541,13 +541,13 @@ def _try_on_models(
             title = f"trying the scene against {name} on every model"
             study.progress.stage(title, n_predictions, hint=hint)
             verifications = [
-                retrials.adversarial(name, u, condition) for condition in conditions
+                retrials.try_adversarial(name, u, condition) for condition in conditions
             ]
             cells[name] = [
                 MatrixCell(
                     model=condition.name,
                     ending=verification.ending.value,
-                    verified=verified_rate(verification),
+                    verified=make_verified_rate(verification),
                 )
                 for condition, verification in zip(
                     conditions, verifications, strict=True
@@ -560,14 +560,14 @@ def _try_clean(retrials: Retrials, condition: RetrialCondition) -> MatrixModel:
     problem = condition.problem
     return MatrixModel(
         model=condition.name,
-        labels=list(problem.task.truth_names(problem.truth())),
+        labels=list(problem.task.truth_names(problem.find_truth())),
         input_size=problem.renderer.formation.resolution,
         spp=condition.spp,
-        clean=control_group(retrials.clean(condition), condition.spp),
+        clean=make_control_group(retrials.try_clean(condition), condition.spp),
     )
 
 
-def models_worker(settings: JsonObject) -> Call:
+def models_worker(settings: JsonObject) -> BatchFunction:
     """Return the function by which a worker evaluates queries of several models.
 
     Args:
@@ -578,9 +578,9 @@ def models_worker(settings: JsonObject) -> Call:
     def load_problem(name: str) -> Problem:
         return problem_from_config(_with_model(config, name))[0]
 
-    return worker_call(cache(load_problem))
+    return make_worker_call(cache(load_problem))
 
 
 def _with_model(config: AttackConfig, name: str) -> AttackConfig:
     """Return the settings of an attack on one of the models."""
-    return AttackConfig.of(config, model=name, ensemble=None)
+    return AttackConfig.from_config(config, model=name, ensemble=None)

@@ -530,7 +530,7 @@ BY_FIELD: dict[str, type[Result]] = {"models": MatrixResult, "curve": CurveResul
 """Other results of the command, by a field that they alone have."""
 
 
-def attack_of(folder: Path) -> AttackSummary:
+def load_attack_summary(folder: Path) -> AttackSummary:
     """Load the result of the attack in a run directory; errors as for `read_result`."""
     result = read_result(folder)
     if not isinstance(result, AttackSummary):

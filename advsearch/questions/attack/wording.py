@@ -60,7 +60,7 @@ def attack_verdict(summary: AttackSummary) -> str:
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} {after_steps}; nothing is verified."
     has_paths = summary.drive is not None and len(summary.drive.paths) > 1
-    rate = words.rate_text(verified) + another_text(summary.over, has_paths)
+    rate = words.rate_text(verified) + condition_text(summary.over, has_paths)
     claim, goal = _clauses(summary, thing)
     if ending == "found":
         error = _error_clause(summary, verified, thing, claim)
@@ -101,12 +101,12 @@ def _random_search_remark(summary: AttackSummary, verified: VerifiedRate) -> str
     return ""
 
 
-def another_text(over: Sequence[str], paths: bool = False) -> str:
+def condition_text(over: Sequence[str], has_several_paths: bool = False) -> str:
     """Return what differs between trials: ``, each with another camera``.
 
     Args:
         over: controls that vary by chance; of a path it is the moment.
-        paths: whether there are several paths.
+        has_several_paths: whether there are several paths.
     """
     controls = [name for name in over if name != PATH]
     parts = []
@@ -114,13 +114,13 @@ def another_text(over: Sequence[str], paths: bool = False) -> str:
         parts.append(f"with another {' and '.join(controls)}")
     if PATH in over:
         moment = "at another moment of the path"
-        if paths:
+        if has_several_paths:
             moment = "on one of several paths, at another moment"
         parts.append(moment)
     return f", each {' and '.join(parts)}" if parts else ""
 
 
-def remarks(summary: AttackSummary) -> list[str]:
+def make_remarks(summary: AttackSummary) -> list[str]:
     """Return what a reader of the result has to know."""
     texts = [_clean_remark(summary), _baseline_remark(summary)]
     return [text for text in texts if text] + summary.warnings
@@ -170,7 +170,7 @@ def _baseline_remark(summary: AttackSummary) -> str:
     return f"Random search with as many renders does {comparison}"
 
 
-def success(summary: AttackSummary) -> str:
+def success_name(summary: AttackSummary) -> str:
     """Return what counts as a success in the trials, in a word."""
     if summary.target:
         return "target"
@@ -380,7 +380,7 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
     return claim, words.wanted(summary.objective, thing)
 
 
-def method_facts(summary: AttackSummary) -> dict[str, str]:
+def method_texts(summary: AttackSummary) -> dict[str, str]:
     """Return how an attack came to its result, by name; empty texts are left out."""
     segments = summary.light_path_segments
     moved = [

@@ -5,7 +5,7 @@ leaves out.
 from __future__ import annotations
 
 from advsearch.extend import RunContext, errors, experiment
-from advsearch.questions.check.result import CheckConfig, CheckResult, shown
+from advsearch.questions.check.result import CheckConfig, CheckResult, make_check_view
 
 
 @experiment(
@@ -18,7 +18,7 @@ from advsearch.questions.check.result import CheckConfig, CheckResult, shown
     positional_args=("object", "model"),
     help_suffix=". Exit status 3 if a gradient is biased or noisy",
     exit_status=lambda result: errors.FELL_SHORT if result.falls_short else 0,
-    view=shown,
+    view=make_check_view,
 )
 def check(context: RunContext[CheckConfig]) -> CheckResult:
     """Compare every gradient of a scene with differences, and plan a search over it

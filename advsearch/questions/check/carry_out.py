@@ -65,7 +65,7 @@ class CheckedPart:
     def title(self) -> str:
         """What the progress says of it."""
         return (
-            f"{self.config.object} in {self.config.lit_by}, "
+            f"{self.config.object} in {self.config.environment_name}, "
             f"{' and '.join(self.config.controls)}"
         )
 
@@ -74,7 +74,7 @@ class CheckedPart:
         config = self.config
         scene_fields = {
             "object": config.object,
-            "environment": config.lit_by,
+            "environment": config.environment_name,
             "loss": self.loss,
         }
         return CheckedRow(**{**vars(measured), **scene_fields, **fields})
@@ -109,7 +109,7 @@ def list_bundled(config: CheckConfig) -> Iterator[CheckConfig]:
             }
             control_fields = {
                 "controls": {control: {}},
-                **workbench.settings_alone(config, control, {}),
+                **workbench.select_run_settings(config, control, {}),
             }
             yield config.model_copy(update={**scene_fields, **control_fields})
 
@@ -144,7 +144,9 @@ class GradientCheck:
         return self.context.result(
             CheckResult,
             object=",".join(dict.fromkeys(config.object for config in configs)),
-            environment=",".join(dict.fromkeys(config.lit_by for config in configs)),
+            environment=",".join(
+                dict.fromkeys(config.environment_name for config in configs)
+            ),
             controls=list(controls),
             measured=self.parts_done,
             planned=len(self.parts),
@@ -200,15 +202,15 @@ class GradientCheck:
         problem, _ = workbench.problem_from_config(config, denoise="none")
         renderer = problem.renderer
         renderer.formation = replace(renderer.formation, transfer="linear")
-        renderer.plan = renderer.plan.at_a_pixel()
-        loss = gradients.smooth_loss(renderer.formation.resolution, config.seed)
+        renderer.plan = renderer.plan.with_pixel_steps()
+        loss = gradients.make_smooth_loss(renderer.formation.resolution, config.seed)
         spp = config.spp if isinstance(config.spp, int) else RAW_SPP
         rows = gradients.measure_derivatives(
             self._make_bench(part, renderer, loss, spp),
             reference_spp=REFERENCE_SPP,
-            seeds_of_reference=N_SEEDS,
+            reference_repeats=N_SEEDS,
             reference_factors=gradients.FACTORS[:2],
-            tried=gradients.list_attempts,
+            list_tries=gradients.list_attempts,
             stage=partial(self._begin_stage, title),
         )
         for row in rows:
@@ -224,13 +226,13 @@ class GradientCheck:
         config = part.config
         problem, _ = workbench.problem_from_config(config)
         renderer = problem.renderer
-        bench = self._make_bench(part, renderer, problem.loss, problem.spp)
+        bench = self._make_bench(part, renderer, problem.compute_loss, problem.spp)
 
         n_gradients = planning.plan_gradients(renderer.plan)
         stage_title = f"{title}: comparing ways to differentiate"
         self.progress.stage(stage_title, n_gradients, hint=HINT)
         measure_bench = replace(bench, seed=seeds.stream(config.seed, "measure"))
-        renderer.plan = planning.measured_plan(measure_bench, counted=True)
+        renderer.plan = planning.measured_plan(measure_bench, count_renders=True)
 
         planned_steps = {group.name: group.step for group in renderer.plan.groups}
         rows = list[results.Measured]()
@@ -250,7 +252,7 @@ class GradientCheck:
         derivatives = gradients.measure_derivatives(
             replace(bench, spp=spp),
             reference_spp=planning.CONVERGED,
-            seeds_of_reference=N_MODEL_SEEDS,
+            reference_repeats=N_MODEL_SEEDS,
             stage=partial(self._begin_stage, title),
         )
         for row in derivatives:
@@ -298,7 +300,7 @@ class GradientCheck:
         return gradients.Bench(
             renderer,
             loss,
-            gradients.interior_point(renderer),
+            gradients.find_interior_point(renderer),
             seeds.stream(part.config.seed, "check"),
             spp,
             store,
@@ -323,11 +325,11 @@ class GradientCheck:
         left_out = ["nothing (`specialise=false`)"]
         if config.specialise:
             left_out = list_left_out(renderer)
-        summary = problem.plan_summary(renderer.plan)
+        summary = problem.summarize_plan(renderer.plan)
         yield SearchPlan(**{**vars(summary), "spp": spp, "left_out": left_out})
         if not config.specialise:
             return
-        u = gradients.interior_point(renderer)
+        u = gradients.find_interior_point(renderer)
         seed = seeds.stream(config.seed, "leaving out")
         hint = "`specialise=false` leaves it out"
         tick = self.progress.advance
@@ -348,7 +350,7 @@ class GradientCheck:
             self.progress.stage(title, MAX_GRADIENTS, hint=hint, at_most=True)
             return measure_gains(
                 renderer,
-                problem.loss,
+                problem.compute_loss,
                 u,
                 seed=seed,
                 spp=problem.spp,
@@ -374,14 +376,14 @@ def list_left_out(renderer: gradients.Renderer) -> list[str]:
         sentences.append(
             "boundary terms: nothing that an adjoint differentiates moves an outline"
         )
-    if not used & gradients.BY_ADJOINT:
+    if not used & gradients.ADJOINT_ESTIMATORS:
         sentences.append("adjoint renders: no coordinate needs one")
-    if not used & gradients.BY_DIFFERENCES:
+    if not used & gradients.DIFFERENCE_ESTIMATORS:
         sentences.append(
             "renders for differences: every derivative is an adjoint or "
             "of the picture itself"
         )
-    if not renderer.scene.volumetric:
+    if not renderer.scene.is_volumetric:
         sentences.append("the volumetric integrator: there is no medium")
     if "material" in used:
         sentences += [

@@ -14,7 +14,7 @@ from torch import Tensor
 from advsearch.extend import gradients, seeds
 from advsearch.questions.check.result import GainRow, TexelRow
 
-ITEMS = gradients.ITEMS
+ITEMS = gradients.OMISSIONS
 EVERYTHING = frozenset(ITEMS)  # leave out all that can be
 NOTHING = frozenset[str]()
 ALL = "everything above"
@@ -107,13 +107,15 @@ def _make_variants(
     is_limited = depth != scene.max_depth
     variants = {"": renderer}
     if is_limited:
-        variants[""] = renderer.like(scene.like(max_depth=depth))
+        variants[""] = renderer.copy_with(scene.copy_with(max_depth=depth))
     for item in ITEMS:
         leave_out = EVERYTHING - {item}
-        variants[item] = renderer.like(scene.like(max_depth=depth, leave_out=leave_out))
+        variants[item] = renderer.copy_with(
+            scene.copy_with(max_depth=depth, leave_out=leave_out)
+        )
     if depth < scene.max_depth:
         variants[BOUNCES] = renderer
-    variants[ALL] = renderer.like(scene.like(leave_out=NOTHING))
+    variants[ALL] = renderer.copy_with(scene.copy_with(leave_out=NOTHING))
     return variants
 
 
@@ -176,7 +178,7 @@ def measure_texels(
         seed: of the renders.
         spp: samples per pixel.
     """
-    inputs = renderer.traced_inputs(u)
+    inputs = renderer.compute_scene_inputs(u)
     rows = list[TexelRow]()
     for group in renderer.plan.groups:
         if group.parameter != "texels":
@@ -215,7 +217,10 @@ def _count_pixels(
     scene = renderer.scene
     white = {**inputs, name: torch.full_like(inputs[name], 1.0)}
     black = {**inputs, name: torch.full_like(inputs[name], 0.0)}
-    difference = scene.guides(white, seed, spp)[0] - scene.guides(black, seed, spp)[0]
+    difference = (
+        scene.render_guides(white, seed, spp)[0]
+        - scene.render_guides(black, seed, spp)[0]
+    )
     return int((difference.amax(dim=-1) > 0.0).sum())
 
 
@@ -228,7 +233,7 @@ def _count_visible_texels(
 ) -> int:
     """Count the texels that reach the camera directly: they have a derivative."""
     scene = renderer.scene
-    with scene.shorter(2):
+    with scene.limit_depth(2):
         ones = torch.ones(*scene.resolution, 3)
-        gradient = scene.adjoint(inputs, ones, seed, spp, wrt=[name])[name]
+        gradient = scene.render_adjoint(inputs, ones, seed, spp, wrt=[name])[name]
     return int((gradient.abs().amax(dim=-1) > 0.0).sum())

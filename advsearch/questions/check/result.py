@@ -77,7 +77,7 @@ class CheckConfig(DerivativeConfig):
     )
 
     @property
-    def title(self) -> tuple[str, ...]:
+    def title_words(self) -> tuple[str, ...]:
         return "all" if self.all else self.object, self.command
 
     @property
@@ -156,7 +156,7 @@ class CheckResult(views.InNotebook, RunResult):
     @property
     def falls_short(self) -> bool:
         """Whether a gradient is biased or noisy."""
-        return bool(short_names(self.rows))
+        return bool(find_inadequate(self.rows))
 
     @property
     def brief(self) -> str:
@@ -230,7 +230,7 @@ LOSSES = {
 }
 
 
-def shown(result: CheckResult) -> ShownResult:
+def make_check_view(result: CheckResult) -> ShownResult:
     """Return the view of a check."""
     rows = result.rows
     sections = [ResultPart(text=[READING] if rows else [])]
@@ -276,7 +276,7 @@ def _verdict(result: CheckResult) -> str:
             f"{stopped} after {result.measured} of {result.planned} parts (a scene, "
             "its controls and a loss)."
         )
-    names = short_names(result.rows)
+    names = find_inadequate(result.rows)
     if names:
         sentences.append(f"No estimator is good enough for {', '.join(names)}.")
     elif result.rows:
@@ -319,7 +319,7 @@ def _left_out_texts(result: CheckResult) -> list[str]:
     return texts
 
 
-def short_names(rows: Sequence[CheckedRow]) -> list[str]:
+def find_inadequate(rows: Sequence[CheckedRow]) -> list[str]:
     """Return the names of what no estimator is good enough for, each once.
 
     For each parameter and loss the row with the best status counts: an estimator that

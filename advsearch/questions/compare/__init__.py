@@ -26,14 +26,14 @@ from advsearch.questions.compare.result import (
     ComparedPair,
     ComparedSide,
     CompareResult,
-    claims,
-    shown,
+    make_compare_claims,
+    make_compare_view,
 )
 
 if TYPE_CHECKING:
     from advsearch.questions.compare.sides import Side
 
-ALWAYS = (
+STORED_SWEEP_SETTINGS = (
     "compared",
     "pictures",
     "seed",
@@ -92,8 +92,8 @@ class CompareConfig(SweepConfig):
         SceneConfig, "run", otherwise="runs/WHAT-compare-NNN"
     )
 
-    _named = settings.texts(several=["compared"])
-    _different = settings.each_once("compared")
+    _named = settings.text_validator(several=["compared"])
+    _different = settings.unique_names_validator("compared")
 
     @field_validator("object", mode="wrap")
     @classmethod
@@ -107,7 +107,7 @@ class CompareConfig(SweepConfig):
         if not self.object:
             for declared in settings.settings(type(self)):
                 if (
-                    declared.field not in ALWAYS
+                    declared.field not in STORED_SWEEP_SETTINGS
                     and getattr(self, declared.field) != declared.default
                 ):
                     raise InputError(
@@ -123,13 +123,13 @@ class CompareConfig(SweepConfig):
         return self
 
     @property
-    def title(self) -> tuple[str, ...]:
+    def title_words(self) -> tuple[str, ...]:
         names = settings.split_names(self.object or self.compared)
         return "-".join(Path(name).stem for name in names), self.command
 
-    def sweep(self) -> SweepConfig:
+    def make_sweep_config(self) -> SweepConfig:
         """Return the sweep of the models that has to be made first."""
-        return SweepConfig.of(self, model=self.compared, trials=0)
+        return SweepConfig.from_config(self, model=self.compared, trials=0)
 
 
 @experiment(
@@ -141,8 +141,8 @@ class CompareConfig(SweepConfig):
     positional=PositionalArgument(
         "WHAT", "the run of a sweep, or models and what they are shown", "", True
     ),
-    view=shown,
-    claims=claims,
+    view=make_compare_view,
+    claims=make_compare_claims,
 )
 def compare(context: RunContext[CompareConfig]) -> CompareResult:
     """Compare models, objects or adversarial scenes pair by pair (docs/compare.md).
@@ -165,7 +165,9 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
     sides: list[Side] = []
     n_renders = 0
     if config.object:
-        result = context.run_part("sweep", config.sweep().with_python_parts_of(config))
+        result = context.run_part(
+            "sweep", config.make_sweep_config().with_python_parts_of(config)
+        )
         n_renders = sum(getattr(result, "renders", {}).values())
         if not result.goes_on:
             sides = read_sides([RunDirectory.locate_part(context.run.path, "sweep")])
@@ -177,7 +179,7 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
     if not sides:
         context.ending = results.INTERRUPTED
     differ = find_different_settings(sides) if sides else []
-    warnings = find_cautions(sides, differ)
+    warnings = find_comparison_warnings(sides, differ)
 
     images = PairImages(context)
     pairs: list[ComparedPair] = []
@@ -188,7 +190,7 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
         except InputError as error:  # the library that finds rules is missing
             warnings.append(f"Where one side is worse was not looked for: {error}")
             pair = compare_sides(sides[0], side, config.seed, with_rules=False)
-        examples = list(images.list_pairs(sides[0], side, number))
+        examples = list(images.list_examples(sides[0], side, number))
         pairs.append(pair.model_copy(update={"shown": examples}))
     return context.result(
         CompareResult,
@@ -205,19 +207,17 @@ def describe_sweeps(config: CompareConfig, sides: Sequence[Side]) -> dict[str, A
     """Return what the compared sweeps are of; without sides yet, from the settings."""
     if not sides:
         return {
-            "environment": config.lit_by,
+            "environment": config.environment_name,
             "controls": list(config.controls),
             "object": config.object,
             "model": config.compared,
             "task": config.task_name,
         }
-    environments = settings.names_together(
-        side.sweep.summary.environment for side in sides
-    )
-    objects = settings.names_together(side.labels["object"] for side in sides)
-    models = settings.names_together(side.labels["model"] for side in sides)
+    environments = settings.join_names(side.sweep.summary.environment for side in sides)
+    objects = settings.join_names(side.labels["object"] for side in sides)
+    models = settings.join_names(side.labels["model"] for side in sides)
     return {
-        "environment": environments or config.lit_by,
+        "environment": environments or config.environment_name,
         "controls": sides[0].sweep.summary.controls,
         "object": objects or config.object,
         "model": models or config.compared,
@@ -235,14 +235,14 @@ def count_side(side: Side) -> ComparedSide:
         **side.labels,
         configurations=len(side.rows),
         correct=int(side.is_right.sum()),
-        accuracy=rules.estimate_share(side.rows),
+        accuracy=rules.estimate_rate(side.rows),
         interval=rules.estimate_interval(side.rows),
         outcomes=rules.count_wrong_outcomes(side.rows),
         seconds=float(side.rows["seconds"].mean()),
     )
 
 
-def find_cautions(sides: Sequence[Side], differ: Sequence[str]) -> list[str]:
+def find_comparison_warnings(sides: Sequence[Side], differ: Sequence[str]) -> list[str]:
     """Return warnings about the sides of a comparison.
 
     Args:

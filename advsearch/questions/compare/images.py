@@ -42,7 +42,9 @@ class PairImages:
     warnings: list[str] = field(default_factory=list)
     _unavailable: set[str] = field(default_factory=set)
 
-    def list_pairs(self, first: Side, second: Side, pair: int) -> Iterator[PairPicture]:
+    def list_examples(
+        self, first: Side, second: Side, pair: int
+    ) -> Iterator[PairPicture]:
         """Yield pairs that only one side gets right, those with the largest margin gap first.
 
         There are at most as many of each side as the settings say, with images as far
@@ -111,7 +113,7 @@ class PairImages:
                 f"Pictures of {sweep.folder.name} are not shown: {error}"
             )
             return
-        self.context.run.write_file(image.file, scenes.thumbnail(image.number))
+        self.context.run.write_file(image.file, scenes.render_thumbnail(image.number))
         self.n_rendered += 1
 
 

@@ -56,7 +56,7 @@ def compare_sides(
         units=None if n_units == len(units) else n_units,
         unit=first.rows.attrs["unit name"],
         **count_pairs(first.is_right, second.is_right, units),
-        p=statistics.clustered.paired_by_unit(first.is_right, second.is_right, units)[
+        p=statistics.clustered.compare_paired(first.is_right, second.is_right, units)[
             2
         ],
         worse=worse,
@@ -90,13 +90,13 @@ def count_pairs(
         first_right, second_right: whether each side is right (n,).
         units: the unit of each pair (n,); pairs of one unit are not independent.
     """
-    difference, interval, _ = statistics.clustered.paired_by_unit(
+    difference, interval, _ = statistics.clustered.compare_paired(
         first_right, second_right, units
     )
-    pairs_per_unit = statistics.clustered.per_unit(np.ones(len(units)), units)
+    pairs_per_unit = statistics.clustered.sum_per_unit(np.ones(len(units)), units)
     shares = [
-        statistics.clustered.mean_share(
-            statistics.clustered.per_unit(is_right, units), pairs_per_unit
+        statistics.clustered.mean_rate(
+            statistics.clustered.sum_per_unit(is_right, units), pairs_per_unit
         )
         for is_right in (first_right, second_right)
     ]
@@ -153,7 +153,7 @@ def find_pair_rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
 def count_exceptions(pairs: pd.DataFrame) -> CountOf:
     """Count the pairs that are not `correct`, with the interval of their share."""
     lower, upper = rules.estimate_interval(pairs)
-    share = None if pairs.empty else 1.0 - rules.estimate_share(pairs)
+    share = None if pairs.empty else 1.0 - rules.estimate_rate(pairs)
     n_exceptions = int((~pairs["correct"]).sum())
     return CountOf(
         count=n_exceptions,

@@ -175,17 +175,17 @@ class CompareResult(views.InNotebook, RunResult):
         )
 
 
-LIKELY = (
+P_VALUE_NOTE = (
     "p: how likely a split so uneven of the pairs that one side alone gets right is "
     "where both are right equally often "
 )
-NOTE = (
-    f"{LIKELY}(exact McNemar test, two-sided). Intervals of differences are Newcombe's "
+MCNEMAR_NOTE = (
+    f"{P_VALUE_NOTE}(exact McNemar test, two-sided). Intervals of differences are Newcombe's "
     "for pairs, of shares "
     "Clopper-Pearson's, each for its row by itself."
 )
-NOTE_OF_UNITS = (
-    f"{LIKELY}(at most, two-sided). Frames of one drive are not independent, nor are "
+UNITS_NOTE = (
+    f"{P_VALUE_NOTE}(at most, two-sided). Frames of one drive are not independent, nor are "
     "pictures of one configuration: p "
     "and intervals are over {units}, by bets, each for its row by itself. All {units} "
     "weigh the same."
@@ -199,14 +199,14 @@ MAX_PICTURES = 3
 """Pairs of each side that a terminal shows; the page has all."""
 
 
-def shown(result: CompareResult) -> ShownResult:
+def make_compare_view(result: CompareResult) -> ShownResult:
     """Return the view of a comparison."""
     columns: dict[str, views.Column] = {
         "": "{0.name}",
         "right in": "{0.correct} of {0.configurations}",
         "accuracy": lambda side: wording.percent(side.accuracy),
         "95 % interval": lambda side: wording.interval_text(side.interval),
-        "time a prediction": lambda side: cost_text(side.seconds),
+        "time a prediction": lambda side: format_prediction_time(side.seconds),
     }
     if any(side.outcomes for side in result.sides):
         columns["the others"] = lambda side: wording.outcomes_text(
@@ -219,13 +219,13 @@ def shown(result: CompareResult) -> ShownResult:
         sections += _pair_sections(pair, has_others=len(result.pairs) > 1)
     summary = "Interrupted before anything was compared."
     if result.pairs:
-        summary = headline(result.pairs[0])
+        summary = summarize_difference(result.pairs[0])
     sweeps = ", ".join(dict.fromkeys(side.run for side in result.sides))
     facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
     return ShownResult(summary, sections, facts, says_interrupted=not result.pairs)
 
 
-def cost_text(seconds: float) -> str:
+def format_prediction_time(seconds: float) -> str:
     """Return the time of a prediction; empty where it is not known."""
     if math.isnan(seconds):
         return ""
@@ -234,7 +234,7 @@ def cost_text(seconds: float) -> str:
     return wording.seconds_text(seconds)
 
 
-def headline(pair: ComparedPair) -> str:
+def summarize_difference(pair: ComparedPair) -> str:
     """Summarise the difference of two sides in a sentence."""
     first_accuracy, second_accuracy = map(wording.percent, pair.accuracies)
     of_units = (
@@ -245,16 +245,16 @@ def headline(pair: ComparedPair) -> str:
         f"{second_accuracy} of the same "
         f"{wording.count(pair.pairs, 'picture')}{of_units}: a difference of "
         f"{100.0 * pair.difference:+.1f} points "
-        f"(95 % interval {points_text(pair.interval)})."
+        f"(95 % interval {format_points_interval(pair.interval)})."
     )
 
 
-def points_text(interval: results.Interval) -> str:
+def format_points_interval(interval: results.Interval) -> str:
     """Return an interval of a difference in percentage points: ``-3.1 to +4.0``."""
     return " to ".join(f"{100.0 * bound:+.1f}" for bound in interval)
 
 
-def alone_text(pair: ComparedPair) -> str:
+def describe_exclusive_pairs(pair: ComparedPair) -> str:
     """Describe in a sentence the pairs that only one side gets right."""
     if not pair.first_only and not pair.second_only:
         return "Both are right about the same pictures."
@@ -272,13 +272,19 @@ def alone_text(pair: ComparedPair) -> str:
 
 def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPart]:
     """Yield the sections about one pair of sides."""
-    sentences = [headline(pair), alone_text(pair)] if has_others else [alone_text(pair)]
+    sentences = (
+        [summarize_difference(pair), describe_exclusive_pairs(pair)]
+        if has_others
+        else [describe_exclusive_pairs(pair)]
+    )
     heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
     rows = [
         [f"{pair.first} right", str(pair.both), str(pair.first_only)],
         [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
     ]
-    note = NOTE if pair.units is None else NOTE_OF_UNITS.format(units=f"{pair.unit}s")
+    note = (
+        MCNEMAR_NOTE if pair.units is None else UNITS_NOTE.format(units=f"{pair.unit}s")
+    )
     yield ResultPart(
         f"{pair.first} and {pair.second}, pair by pair", sentences, heads, rows, note
     )
@@ -322,7 +328,9 @@ def _parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
 def _part_cells(part: PairPart) -> list[str]:
     """Return the cells of a row of a parameter's table."""
     accuracies = [wording.percent(accuracy) for accuracy in part.accuracies]
-    difference = f"{100.0 * part.difference:+.0f} ({points_text(part.interval)})"
+    difference = (
+        f"{100.0 * part.difference:+.0f} ({format_points_interval(part.interval)})"
+    )
     alone = [str(part.first_only), str(part.second_only)]
     return [
         wording.value_text(part.value),
@@ -415,12 +423,12 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     yield ResultPart(title, without_pictures, pictures=groups, only="page")
 
 
-def claims(result: CompareResult) -> Iterator[views.Claim]:
+def make_compare_claims(result: CompareResult) -> Iterator[views.Claim]:
     """Yield a claim for each pair."""
     for pair in result.pairs:
         method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
         statement = (
-            f"{headline(pair)} {alone_text(pair)} The interval of the "
+            f"{summarize_difference(pair)} {describe_exclusive_pairs(pair)} The interval of the "
             f"difference is {method}."
         )
         side = next(side for side in result.sides if side.name == pair.second)

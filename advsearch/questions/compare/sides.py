@@ -79,7 +79,7 @@ class Side:
         return [name for name in names if self.rows[name].nunique() > 1]
 
 
-def read_sides(folders: Sequence[Path]) -> list[Side]:
+def read_sides(paths: Sequence[Path]) -> list[Side]:
     """Read the sides that sweeps compare, each with a different name.
 
     A sweep has a side for each of its models. The sweep of an adversarial scene has
@@ -91,13 +91,13 @@ def read_sides(folders: Sequence[Path]) -> list[Side]:
     """
     sides = [
         side
-        for folder in folders
-        for side in read_sides_of(folder, is_only=len(folders) == 1)
+        for folder in paths
+        for side in read_sweep_sides(folder, is_only_sweep=len(paths) == 1)
     ]
     if len(sides) < 2:
         raise InputError(
             "compared: expected a sweep of several models, or several sweeps, got "
-            f"{folders[0]}, a sweep of one model; "
+            f"{paths[0]}, a sweep of one model; "
             "name another sweep of the same draws beside it, or give `model` two "
             "models when you sweep"
         )
@@ -108,7 +108,7 @@ def read_sides(folders: Sequence[Path]) -> list[Side]:
     if not in_view.any():
         raise InputError(
             "compared: expected pictures with the object in them, got "
-            f"none in {folders[0]}"
+            f"none in {paths[0]}"
         )
     return [
         replace(side, name=name, rows=side.rows[in_view].reset_index(drop=True))
@@ -143,25 +143,25 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
     return names
 
 
-def read_sides_of(folder: Path, *, is_only: bool) -> Iterator[Side]:
+def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
     """Yield the sides of one sweep, without names.
 
     Args:
-        folder: the run directory of the sweep.
-        is_only: whether no other sweep is compared.
+        path: the run directory of the sweep.
+        is_only_sweep: whether no other sweep is compared.
     """
-    sweep = workbench.StoredSweep.read(folder)
+    sweep = workbench.StoredSweep.read(path)
     summary = sweep.summary
     if summary.goes_on or summary.looked_at != summary.planned:
         raise errors.FileFormatError(
-            f"{folder}: expected a sweep that has ended, got one with "
+            f"{path}: expected a sweep that has ended, got one with "
             f"{summary.looked_at} of {summary.planned} "
-            f"predictions; go on with it: advsearch resume {folder}"
+            f"predictions; go on with it: advsearch resume {path}"
         )
     rows = sweep.read_rows()
     if len(rows) != summary.planned or not rows["step"].is_unique:
         raise errors.FileFormatError(
-            f"{folder}: expected {summary.planned} rows, as its summary says, got "
+            f"{path}: expected {summary.planned} rows, as its summary says, got "
             f"{len(rows)}; sweep again"
         )
     models = sweep.config.models
@@ -171,7 +171,9 @@ def read_sides_of(folder: Path, *, is_only: bool) -> Iterator[Side]:
     scene_masks = [rows["number"] >= 0]
     if sweep.config.adversarial_of:
         is_adversarial = rows["number"] >= summary.planned // len(models) // 2
-        scene_masks = [~is_adversarial, is_adversarial] if is_only else [is_adversarial]
+        scene_masks = (
+            [~is_adversarial, is_adversarial] if is_only_sweep else [is_adversarial]
+        )
     for is_of_scene in scene_masks:
         for index, model in enumerate(models):
             side_rows = rows[is_of_scene & (model_index == index)].reset_index(
@@ -194,7 +196,10 @@ def check_same_draws(first: Side, second: Side) -> None:
         return
     where = f"{first.sweep.folder} and {second.sweep.folder}"
     for name in DRAW_SETTINGS:
-        if first.sweep.config.deciding()[name] != second.sweep.config.deciding()[name]:
+        if (
+            first.sweep.config.get_deciding_settings()[name]
+            != second.sweep.config.get_deciding_settings()[name]
+        ):
             raise InputError(
                 f"compared: expected sweeps of the same draws, got {where}, whose "
                 f"`{name}` differ; sweep one of them "
@@ -235,7 +240,7 @@ def has_same_values(first: pd.Series, second: pd.Series) -> bool:
 
 def find_different_settings(sides: Sequence[Side]) -> list[str]:
     """Return the names of the settings that decide predictions and differ between sides."""
-    first, *others = (side.sweep.config.deciding() for side in sides)
+    first, *others = (side.sweep.config.get_deciding_settings() for side in sides)
     names = {name for other in others for name in other if other[name] != first[name]}
     names |= {
         column

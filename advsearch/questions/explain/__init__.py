@@ -27,9 +27,9 @@ from advsearch.extend import (
 from advsearch.questions.explain.result import (
     ExplainResult,
     RuleRow,
-    claims,
-    shown,
-    triggering,
+    list_rule_triggers,
+    make_explain_claims,
+    make_explain_view,
 )
 
 if TYPE_CHECKING:
@@ -81,11 +81,11 @@ class ExplainConfig(Config):
     )
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    _named = settings.texts("run", several=["sweeps"])
-    _different = settings.each_once("sweeps")
+    _named = settings.text_validator("run", several=["sweeps"])
+    _different = settings.unique_names_validator("sweeps")
 
     @property
-    def title(self) -> tuple[str, ...]:
+    def title_words(self) -> tuple[str, ...]:
         return Path(settings.split_names(self.sweeps)[0]).name, self.command
 
 
@@ -96,9 +96,9 @@ class ExplainConfig(Config):
     positional_args=("sweeps",),
     about="sweeps",
     positional=PositionalArgument("RUN", "the run of a sweep", "", True),
-    view=shown,
-    claims=claims,
-    triggering=triggering,
+    view=make_explain_view,
+    claims=make_explain_claims,
+    triggering=list_rule_triggers,
 )
 def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     """Find rules under which a model is wrong, and confirm them (docs/explain.md).
@@ -146,24 +146,22 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     return context.result(
         ExplainResult,
         sweeps=[str(sweep.folder) for sweep in sweeps],
-        object=settings.names_together(sweep.summary.object for sweep in sweeps),
-        model=settings.names_together(sweep.summary.model for sweep in sweeps),
-        environment=settings.names_together(
-            sweep.summary.environment for sweep in sweeps
-        ),
+        object=settings.join_names(sweep.summary.object for sweep in sweeps),
+        model=settings.join_names(sweep.summary.model for sweep in sweeps),
+        environment=settings.join_names(sweep.summary.environment for sweep in sweeps),
         controls=sweeps[0].summary.controls,
         parameters=list(table.attrs["units"]),
         **vars(findings.count_right(table)),
         units=None if table["unit"].is_unique else table["unit"].nunique(),
         rules=rule_rows,
-        not_told=findings.describe_rejected(found_rules.best_rejected, len(table)),
+        not_told=findings.make_rejected_rule(found_rules.best_rejected, len(table)),
         importance=importance,
         envelope=envelope,
         pairs=pairs,
         pairs_sought=renders.pairs_sought,
         clusters=clusters,
         renders=renders.n_renders,
-        warnings=[*renders.warnings, *findings.find_cautions(table, importance)],
+        warnings=[*renders.warnings, *findings.find_row_warnings(table, importance)],
     )
 
 
@@ -192,14 +190,12 @@ def read_table(sweeps: Sequence[StoredSweep]) -> tuple[pd.DataFrame, pd.DataFram
     return rows, table
 
 
-def find_sweeps(folder: Path) -> list[Path]:
+def find_sweeps(path: Path) -> list[Path]:
     """Return the directories of the sweeps of a run: its own, or those of a recipe's parts."""
-    result = read_result(folder)
+    result = read_result(path)
     if result.command != "recipe":
-        return [folder]
+        return [path]
     parts = [part for part in getattr(result, "parts", ()) if part.command == "sweep"]
     if not parts:
-        raise InputError(
-            f"explain: expected sweeps, got {folder}, a recipe without one"
-        )
-    return [RunDirectory.locate_part(folder, part.name) for part in parts]
+        raise InputError(f"explain: expected sweeps, got {path}, a recipe without one")
+    return [RunDirectory.locate_part(path, part.name) for part in parts]

@@ -20,9 +20,9 @@ from advsearch.questions.explain.result import EnvelopeRow
 
 PEELED_FRACTION = 0.05
 """Fraction of the rows in the box that one peel removes at one bound."""
-MIN_INSIDE = 60
+MIN_BOX_UNITS = 60
 """Fewer rows, or drives, than this cannot show an accuracy of 95 %."""
-RESERVE = 0.01
+ACCURACY_RESERVE = 0.01
 """Additional accuracy of the choosing rows, which are biased since they chose the box."""
 
 
@@ -40,7 +40,7 @@ def find_envelope(
     """
     if choosing.empty:
         return None
-    required = min(accuracy + RESERVE, (1.0 + accuracy) / 2.0)
+    required = min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
     box: rules.RuleConditions = ()
     inside = choosing
     while rules.estimate_interval(inside)[0] < required:
@@ -67,16 +67,16 @@ def find_best_peel(
     is_independent = choosing["unit"].is_unique
     best_box = None
     best_accuracy = -1.0
-    for smaller_box in peel(box, inside):
+    for smaller_box in list_peels(box, inside):
         rest = choosing[rules.find_covered(smaller_box, choosing)]
         n_draws = len(rest) if is_independent else rest["unit"].nunique()
-        if n_draws >= MIN_INSIDE and rest["correct"].mean() > best_accuracy:
+        if n_draws >= MIN_BOX_UNITS and rest["correct"].mean() > best_accuracy:
             best_box = smaller_box
             best_accuracy = rest["correct"].mean()
     return best_box
 
 
-def peel(
+def list_peels(
     box: rules.RuleConditions, inside: pd.DataFrame
 ) -> Iterator[rules.RuleConditions]:
     """Yield boxes that are slightly smaller than `box`, in one factor each.
@@ -88,7 +88,7 @@ def peel(
     condition_of_factor = {condition.factor: condition for condition in box}
     for factor, unit in inside.attrs["units"].items():
         condition = condition_of_factor.get(factor, rules.RuleCondition(factor, unit))
-        for smaller in peel_factor(condition, inside[factor]):
+        for smaller in list_factor_peels(condition, inside[factor]):
             if smaller != condition and smaller.low < smaller.high:
                 conditions = {**condition_of_factor, factor: smaller}
                 yield tuple(
@@ -98,7 +98,7 @@ def peel(
                 )
 
 
-def peel_factor(
+def list_factor_peels(
     condition: rules.RuleCondition, column: pd.Series
 ) -> Iterator[rules.RuleCondition]:
     """Yield conditions without one name, or without the lowest or highest values."""

@@ -9,16 +9,20 @@ from typing import Any
 import pandas as pd
 
 from advsearch.extend import rules
-from advsearch.questions.explain.result import ParameterWeight, RightOf, RuleNotTold
+from advsearch.questions.explain.result import (
+    ParameterWeight,
+    RejectedRule,
+    RightCounts,
+)
 
 
-def count_right(rows: pd.DataFrame) -> RightOf:
+def count_right(rows: pd.DataFrame) -> RightCounts:
     """Count right rows; the fraction is the mean over units."""
-    return RightOf(
+    return RightCounts(
         right=int(rows["correct"].sum()),
         total=len(rows),
         interval=rules.estimate_interval(rows),
-        share=None if rows.empty else rules.estimate_share(rows),
+        share=None if rows.empty else rules.estimate_rate(rows),
         outcomes=rules.count_wrong_outcomes(rows),
     )
 
@@ -33,15 +37,15 @@ def describe_rule(rule: rules.CountedRule) -> dict[str, Any]:
     }
 
 
-def describe_rejected(
+def make_rejected_rule(
     rule: rules.CountedRule | None, n_rows: int
-) -> RuleNotTold | None:
+) -> RejectedRule | None:
     """Return the result of a rule that is not significant among `n_rows` rows."""
     if rule is None:
         return None
     factor = rule.find_needed_factor()
     n_needed = None if factor is None else round_up(factor * n_rows)
-    return RuleNotTold(
+    return RejectedRule(
         **describe_rule(rule),
         chance=rule.p_value,
         asked=rules.SIGNIFICANCE,
@@ -55,7 +59,7 @@ def round_up(count: float) -> int:
     return math.ceil(count / step) * step
 
 
-def find_cautions(
+def find_row_warnings(
     table: pd.DataFrame, importance: Sequence[ParameterWeight]
 ) -> list[str]:
     """Return warnings about the rows of a table and the importance of its factors."""

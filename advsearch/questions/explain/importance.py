@@ -36,7 +36,7 @@ from advsearch.questions.explain.result import ParameterWeight
 
 MAX_GROUPS = 20
 """Of one factor."""
-ROWS_IN_A_CELL = 25
+MIN_ROWS_PER_CELL = 25
 """Average rows of a cell of two factors' groups, at least."""
 SIGNIFICANCE = 0.01
 """Probability that any pair is reported if no factors interact (Bonferroni)."""
@@ -63,11 +63,11 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
 
     n_groups = round(sample.n_clusters ** (1.0 / 3.0))
     single_weights = [
-        sample.measure([factor], cut_into_groups(table[factor], n_groups))
+        sample.estimate_weight([factor], cut_into_groups(table[factor], n_groups))
         for factor in factors
     ]
 
-    n_coarse_groups = max(2, math.isqrt(sample.n_clusters // ROWS_IN_A_CELL))
+    n_coarse_groups = max(2, math.isqrt(sample.n_clusters // MIN_ROWS_PER_CELL))
     coarse_groups = {
         factor: cut_into_groups(table[factor], n_coarse_groups) for factor in factors
     }
@@ -79,11 +79,11 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
             joint_group, coarse_groups[first], coarse_groups[second]
         )
         if p_value < SIGNIFICANCE / len(pairs):
-            pair_weights.append(sample.measure([first, second], joint_group))
-    return [*sort_by_share(single_weights), *sort_by_share(pair_weights)]
+            pair_weights.append(sample.estimate_weight([first, second], joint_group))
+    return [*sort_by_fraction(single_weights), *sort_by_fraction(pair_weights)]
 
 
-def sort_by_share(weights: list[ParameterWeight]) -> list[ParameterWeight]:
+def sort_by_fraction(weights: list[ParameterWeight]) -> list[ParameterWeight]:
     """Sort weights by their fraction of the variance, the largest first."""
     return sorted(weights, key=lambda weight: -weight.share)
 
@@ -132,7 +132,7 @@ class ClusteredPredictions:
         self.mean = float(np.average(self.correct, weights=self.weight))
         self.variance = self.mean * (1.0 - self.mean)
 
-    def explained_share(self, group: IntArray) -> tuple[float, int]:
+    def explained_fraction(self, group: IntArray) -> tuple[float, int]:
         """Return the fraction of the variance between groups, and the number of used groups."""
         group_weight = np.bincount(group, self.weight)
         is_used = group_weight > 0
@@ -143,12 +143,12 @@ class ClusteredPredictions:
         sum_of_squares = float((used_weight * (group_rate - self.mean) ** 2).sum())
         return sum_of_squares / len(self.correct) / self.variance, len(group_rate)
 
-    def measure(self, factors: list[str], group: IntArray) -> ParameterWeight:
+    def estimate_weight(self, factors: list[str], group: IntArray) -> ParameterWeight:
         """Estimate the fraction of the variance between groups with its 95 % interval.
 
         What chance adds to the fraction is subtracted.
         """
-        share, n_groups = self.explained_share(group)
+        share, n_groups = self.explained_fraction(group)
         expected_statistic = self.expected_statistic(group)
         if n_groups < 2 or math.isnan(expected_statistic):
             return ParameterWeight(
@@ -237,9 +237,9 @@ class ClusteredPredictions:
 
         The statistic of both factors is compared with the sum of each factor's.
         """
-        joint_share, n_cells = self.explained_share(joint_group)
-        first_share, n_first = self.explained_share(first_group)
-        second_share, n_second = self.explained_share(second_group)
+        joint_share, n_cells = self.explained_fraction(joint_group)
+        first_share, n_first = self.explained_fraction(first_group)
+        second_share, n_second = self.explained_fraction(second_group)
         statistic = len(self.correct) * (joint_share - first_share - second_share)
         degrees = max(1, n_cells - n_first - n_second + 1)
         if self.is_independent:

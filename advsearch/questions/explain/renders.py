@@ -38,15 +38,15 @@ from advsearch.questions.explain.result import (
 )
 from advsearch.questions.explain.rows import read_predictions, read_values
 from advsearch.questions.explain.sweeps import (
-    is_drawn,
+    is_sampled,
     is_settable,
-    sweep_along,
-    sweep_inside,
+    make_sweep_along,
+    make_sweep_inside,
 )
 
 MAX_ARCS = 2
 """Arcs of a circle that a condition on an angle has, at most."""
-MIN_REST = 0.2
+MIN_UNCOVERED_FRACTION = 0.2
 """Lower limit of the fraction of a rule that no earlier rule covers.
 
 More configurations are rendered the smaller it is, so that enough are left.
@@ -129,7 +129,10 @@ class Renders:
         rule = counted_rules[index]
         earlier_conditions = [earlier.conditions for earlier in counted_rules[:index]]
         covered_rows = self.table[rules.find_covered(rule.conditions, self.table)]
-        rest = max(float(is_outside(earlier_conditions, covered_rows).mean()), MIN_REST)
+        rest = max(
+            float(is_outside(earlier_conditions, covered_rows).mean()),
+            MIN_UNCOVERED_FRACTION,
+        )
 
         fresh_frames = []
         for sweep_index, sweep in enumerate(self.sweeps):
@@ -142,7 +145,7 @@ class Renders:
                     f"rule {index + 1}: rendering about {samples} "
                     "configurations inside it"
                 )
-                config = sweep_inside(
+                config = make_sweep_inside(
                     sweep.config, self.table, rule.conditions, samples, seed, arc
                 )
                 suffix = f"-{arc}" if arc else ""
@@ -214,7 +217,8 @@ class Renders:
         for repeat in range(2):
             seed = seeds.stream(self.config.seed, f"{label} {repeat}")
             rows = self.render_rows(
-                f"{label}-{repeat}", sweep_along(config, row, factor, self.table, seed)
+                f"{label}-{repeat}",
+                make_sweep_along(config, row, factor, self.table, seed),
             )
             if rows is None:
                 return None
@@ -355,7 +359,7 @@ class Renders:
         features = sweep.scenes.find_features()
         images = []
         for number in numbers:
-            images.append(sweep.scenes.picture(number))
+            images.append(sweep.scenes.render_image(number))
             self.progress.advance(1)
         return torch.stack(images), features
 
@@ -365,7 +369,7 @@ def count_arcs(config: SweepConfig, conditions: rules.RuleConditions) -> int:
     n_arcs = [
         len(condition.arcs)
         for condition in conditions
-        if is_drawn(config, condition.factor)
+        if is_sampled(config, condition.factor)
     ]
     return max(n_arcs, default=1) or 1
 

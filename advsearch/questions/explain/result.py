@@ -10,7 +10,7 @@ from pydantic import Field
 from advsearch.extend import ResultPart, RunResult, ShownResult, results, views, wording
 
 
-class RightOf(results.Fields):
+class RightCounts(results.Fields):
     """Counts of right predictions with an interval."""
 
     right: int = Field(description="right predictions")
@@ -36,14 +36,14 @@ class RightOf(results.Fields):
         outcomes = wording.outcomes_text(self.outcomes)
         return f"{share} ({outcomes})" if outcomes else share
 
-    def extent(self, what: str) -> results.Extent:
-        """Return the counts for a claim; `what` says what is counted."""
+    def make_extent(self, counted_text: str) -> results.Extent:
+        """Return the counts for a claim; `counted_text` says what is counted."""
         return results.Extent.from_count(
-            what, self.right, self.total, self.interval, self.share
+            counted_text, self.right, self.total, self.interval, self.share
         )
 
 
-class Confirmation(RightOf):
+class Confirmation(RightCounts):
     """Fresh renders inside a rule that no rule before it covers."""
 
     held: bool = Field(
@@ -53,14 +53,14 @@ class Confirmation(RightOf):
     )
 
 
-class RuleRow(RightOf):
+class RuleRow(RightCounts):
     """A rule under which the model is wrong more often than elsewhere.
 
     It is counted on rows that did not choose it.
     """
 
     conditions: list[results.ConditionRow] = Field(description="all of which hold")
-    elsewhere: RightOf = Field(description="rows under no rule so far")
+    elsewhere: RightCounts = Field(description="rows under no rule so far")
     confirmed: Confirmation | None = Field(
         description="fresh renders drawn inside the rule, and `held`, whether they "
         "tell it again; null where none were "
@@ -68,11 +68,11 @@ class RuleRow(RightOf):
     )
 
 
-class RuleNotTold(RightOf):
+class RejectedRule(RightCounts):
     """The best rule that is not significant, counted on rows that did not choose it."""
 
     conditions: list[results.ConditionRow] = Field(description="all of which hold")
-    elsewhere: RightOf = Field(description="rows under no rule so far")
+    elsewhere: RightCounts = Field(description="rows under no rule so far")
     chance: float = Field(
         description="how likely so few right predictions are by chance"
     )
@@ -98,7 +98,7 @@ class ParameterWeight(results.Fields):
     )
 
 
-class EnvelopeRow(RightOf):
+class EnvelopeRow(RightCounts):
     """A box of values inside which the model has at least an accuracy."""
 
     conditions: list[results.ConditionRow] = Field(
@@ -150,7 +150,7 @@ class FailureClusters(results.Fields):
     listed: list[FailureCluster] = Field(description="the largest first")
 
 
-class ExplainResult(RunResult, RightOf):
+class ExplainResult(RunResult, RightCounts):
     """Rules, importance and clusters of a model's failures, from the rows of sweeps.
 
     `right` and `of` are those of all rows.
@@ -169,7 +169,7 @@ class ExplainResult(RunResult, RightOf):
     )
     parameters: list[str] = Field(description="what varies in all of the rows")
     rules: list[RuleRow]
-    not_told: RuleNotTold | None = Field(
+    not_told: RejectedRule | None = Field(
         default=None, description="the next rule, which is not told; absent without"
     )
     importance: list[ParameterWeight] = Field(
@@ -217,10 +217,10 @@ MAX_LABELS = 3
 """Predictions of a cluster that a caption names."""
 
 
-def shown(result: ExplainResult) -> ShownResult:
+def make_explain_view(result: ExplainResult) -> ShownResult:
     """Return the view of an explanation."""
     rule_sentences = [
-        f"{number}. {rule_text(number, rule)}"
+        f"{number}. {describe_rule_row(number, rule)}"
         for number, rule in enumerate(result.rules, start=1)
     ]
     note = ""
@@ -235,17 +235,19 @@ def shown(result: ExplainResult) -> ShownResult:
             "wrong more often than elsewhere."
         )
     sections = [
-        ResultPart("Rules", [*rule_sentences, not_told_text(result)], note=note),
+        ResultPart(
+            "Rules", [*rule_sentences, describe_rejected_rule(result)], note=note
+        ),
         ResultPart.table(
             result.importance[:MAX_WEIGHTS],
             WEIGHT_COLUMNS,
             title="What decides",
             note=IMPORTANCE_NOTE,
         ),
-        ResultPart("Where it can be relied on", [envelope_text(result)]),
+        ResultPart("Where it can be relied on", [describe_envelope(result)]),
     ]
     if result.pairs_sought:
-        sections.append(ResultPart("One thing changed", [pairs_text(result)]))
+        sections.append(ResultPart("One thing changed", [describe_pairs(result)]))
     sections += [_pair_section(pair) for pair in result.pairs]
     if result.clusters:
         sections.append(_cluster_section(result.clusters))
@@ -280,7 +282,7 @@ def _format_value(value: str | float) -> str:
     return value if isinstance(value, str) else f"{value:.4g}"
 
 
-def rule_text(number: int, rule: RuleRow) -> str:
+def describe_rule_row(number: int, rule: RuleRow) -> str:
     """Describe a rule with its counts and its confirmation in a sentence.
 
     `number` counts from 1.
@@ -296,16 +298,16 @@ def rule_text(number: int, rule: RuleRow) -> str:
     return f"{text} Fresh renders inside it: right in {rule.confirmed.text}; {verdict}."
 
 
-def triggering(result: ExplainResult) -> Iterator[str]:
+def list_rule_triggers(result: ExplainResult) -> Iterator[str]:
     """Yield the rules in words, and whether fresh renders confirm each."""
     for number, rule in enumerate(result.rules, start=1):
         state = "Counted on rows that did not choose it, not rendered"
         if rule.confirmed is not None:
             state = "Confirmed" if rule.confirmed.held else "Not confirmed"
-        yield f"{state}: {rule_text(number, rule)}"
+        yield f"{state}: {describe_rule_row(number, rule)}"
 
 
-def not_told_text(result: ExplainResult) -> str:
+def describe_rejected_rule(result: ExplainResult) -> str:
     """Describe the best rule that is not significant, and how many rows it would take.
 
     Empty if there is none.
@@ -333,7 +335,7 @@ def not_told_text(result: ExplainResult) -> str:
     )
 
 
-def envelope_text(result: ExplainResult) -> str:
+def describe_envelope(result: ExplainResult) -> str:
     """Return in a sentence where the model can be relied on."""
     box = result.envelope
     if box is None:
@@ -350,7 +352,7 @@ def envelope_text(result: ExplainResult) -> str:
     )
 
 
-def pairs_text(result: ExplainResult) -> str:
+def describe_pairs(result: ExplainResult) -> str:
     """Describe for how many failures a nearby right configuration was found."""
     failures = result.total - result.right
     left = failures - result.pairs_sought
@@ -386,14 +388,14 @@ def _cluster_section(clusters: FailureClusters) -> ResultPart:
     return ResultPart("Kinds of failures", [text], pictures=[pictures])
 
 
-def claims(result: ExplainResult) -> Iterator[views.Claim]:
+def make_explain_claims(result: ExplainResult) -> Iterator[views.Claim]:
     """Yield the claims that the rules and the envelope support."""
     for number, rule in enumerate(result.rules, 1):
-        counts: RightOf = rule.confirmed or rule
+        counts: RightCounts = rule.confirmed or rule
         source = "rows that did not choose the rule"
         if rule.confirmed:
             source = "fresh renders"
-        extent = counts.extent(f"right, of {source}")
+        extent = counts.make_extent(f"right, of {source}")
         where = f"{wording.conditions_text(rule.conditions)} (rule {number})"
         inside = f"{wording.share_text(extent)} {source}"
         statement = (
@@ -403,7 +405,7 @@ def claims(result: ExplainResult) -> Iterator[views.Claim]:
         yield views.Claim(kind="measured", statement=statement, extent=extent)
     box = result.envelope
     if box is not None and box.held and box.total:
-        extent = box.extent("right, of rows that did not choose the box")
+        extent = box.make_extent("right, of rows that did not choose the box")
         where = wording.conditions_text(box.conditions)
         inside = (
             f"{wording.share_text(extent)} configurations that did not choose this box"
@@ -414,5 +416,5 @@ def claims(result: ExplainResult) -> Iterator[views.Claim]:
         yield views.Claim(kind="measured", statement=statement, extent=extent)
     elif not result.rules:
         reason = "no box of values was shown to keep the accuracy that was asked for"
-        statement = f"Nothing is claimed: {reason}. {envelope_text(result)}"
+        statement = f"Nothing is claimed: {reason}. {describe_envelope(result)}"
         yield views.Claim(kind="nothing claimed", statement=statement, extent=None)

@@ -9,10 +9,10 @@ import pandas as pd
 
 from advsearch.extend import rules, wording, workbench
 
-OUTER = ("object", "environment", "model")
+SCENE_SETTINGS = ("object", "environment", "model")
 """Settings of a sweep that its rows have as columns, whether they vary or not."""
 
-EXTENT = ("samples", "keep_pictures", "surface", "trials", "verify_spp")
+EXTENT_SETTINGS = ("samples", "keep_pictures", "surface", "trials", "verify_spp")
 """Settings of a sweep that change neither the image with a number nor its
 prediction.
 """
@@ -29,7 +29,7 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
     frames = []
     for index, sweep in enumerate(sweeps):
         rows = sweep.read_rows()
-        for name in OUTER:
+        for name in SCENE_SETTINGS:
             if name in rows:
                 full_names = rows[name].astype(object)
             else:
@@ -42,7 +42,7 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
     units = {
         name: unit for frame in frames for name, unit in frame.attrs["units"].items()
     }
-    units = {**units, **dict.fromkeys(OUTER, "")}
+    units = {**units, **dict.fromkeys(SCENE_SETTINGS, "")}
     table = pd.concat(frames, ignore_index=True)
     table = table[~table.duplicated("image")].reset_index(drop=True)
     for name in units:
@@ -86,11 +86,11 @@ def name_images(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     """
     deciding = {
         name: value
-        for name, value in sweep.config.deciding().items()
-        if name not in EXTENT
+        for name, value in sweep.config.get_deciding_settings().items()
+        if name not in EXTENT_SETTINGS
     }
-    parameters = [name for name in rows.attrs["units"] if name not in OUTER]
-    values = rows[[*OUTER, *parameters]].astype(str).agg(" ".join, axis=1)
+    parameters = [name for name in rows.attrs["units"] if name not in SCENE_SETTINGS]
+    values = rows[[*SCENE_SETTINGS, *parameters]].astype(str).agg(" ".join, axis=1)
     cells = zip(rows["step"], values, rows["correct"], strict=True)
     return [f"{deciding} {step} {text} {correct}" for step, text, correct in cells]
 

@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 
 from advsearch.extend import Parameter, SweepConfig, rules, settings, wording
-from advsearch.questions.explain.rows import OUTER
+from advsearch.questions.explain.rows import SCENE_SETTINGS
 
-N_ALONG = 9
+N_VALUES_ALONG = 9
 """Values of a factor that are tried to find the nearest right prediction."""
 
 
-def sweep_inside(
+def make_sweep_inside(
     config: SweepConfig,
     table: pd.DataFrame,
     conditions: rules.RuleConditions,
@@ -43,7 +43,7 @@ def sweep_inside(
         name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]
     }
 
-    outer = cut_outer(config, values_inside)
+    outer = cut_scene_settings(config, values_inside)
     n_scenes = math.prod(
         len(settings.split_names(names)) if names else 1 for names in outer.values()
     )
@@ -66,12 +66,12 @@ def sweep_inside(
 
     controls = cut_controls(config, table, conditions, arc)
     draws = math.ceil(samples / n_points) if controls else None
-    return make_quiet(
+    return make_minimal_config(
         config, grid=grid, controls=controls, samples=draws, seed=seed, **outer
     )
 
 
-def cut_outer(
+def cut_scene_settings(
     config: SweepConfig, values_inside: Mapping[str, Sequence[Any]]
 ) -> dict[str, str | None]:
     """Return the objects, environments and models that have rows under conditions.
@@ -80,7 +80,7 @@ def cut_outer(
         config: settings of the sweep.
         values_inside: values that each factor has under the conditions.
     """
-    outer = {name: getattr(config, name) for name in OUTER}
+    outer = {name: getattr(config, name) for name in SCENE_SETTINGS}
     for name, setting in outer.items():
         if name not in values_inside or setting is None:
             continue
@@ -96,11 +96,11 @@ def cut_controls(
 ) -> dict[str, dict[str, Any]]:
     """Return the controls of a sweep with their sampled ranges cut to conditions.
 
-    See `sweep_inside`.
+    See `make_sweep_inside`.
     """
     controls = {name: dict(options) for name, options in config.controls.items()}
     for condition in conditions:
-        if condition.options is not None or not is_drawn(config, condition.factor):
+        if condition.options is not None or not is_sampled(config, condition.factor):
             continue
         instance, _, parameter = condition.factor.partition(".")
         declared = config.declared_parameters(instance) or {}
@@ -131,7 +131,7 @@ def observed_ranges(
     ranges: dict[str, Any] = {}
     for name, parameter in declared.items():
         column = table.get(f"{instance}.{name}")
-        if column is None or not is_drawn(config, f"{instance}.{name}"):
+        if column is None or not is_sampled(config, f"{instance}.{name}"):
             continue
         if parameter.options:
             ranges[name] = {"choices": column.cat.categories.tolist()}
@@ -140,7 +140,7 @@ def observed_ranges(
     return ranges
 
 
-def sweep_along(
+def make_sweep_along(
     config: SweepConfig,
     row: Mapping[str, float | str],
     factor: str,
@@ -157,7 +157,7 @@ def sweep_along(
     else:
         candidates = [
             float(f"{value:.4g}")
-            for value in np.linspace(column.min(), column.max(), N_ALONG)
+            for value in np.linspace(column.min(), column.max(), N_VALUES_ALONG)
         ]
     values = list(dict.fromkeys([row[factor], *candidates]))
 
@@ -166,9 +166,9 @@ def sweep_along(
     }
     outer = {
         name: next(iter(find_names(config, name, str(row[name]))), None)
-        for name in OUTER
+        for name in SCENE_SETTINGS
     }
-    if factor in OUTER:
+    if factor in SCENE_SETTINGS:
         outer[factor] = ",".join(
             name for value in values for name in find_names(config, factor, str(value))
         )
@@ -181,8 +181,8 @@ def sweep_along(
     changes: dict[str, object] = {"keep_pictures": "all", "set": set_values}
     # ten images take less than a worker takes to load
     changes |= {"workers": None, "cluster": None}
-    controls = keep_choices(config, grid)
-    return make_quiet(
+    controls = select_choices(config, grid)
+    return make_minimal_config(
         config,
         grid=grid,
         controls=controls,
@@ -193,7 +193,7 @@ def sweep_along(
     )
 
 
-def keep_choices(
+def select_choices(
     config: SweepConfig, grid: Mapping[str, object]
 ) -> dict[str, dict[str, Any]]:
     """Return the controls whose choices matter though a grid sets all of their parameters."""
@@ -205,7 +205,7 @@ def keep_choices(
         choices = {choice.name for choice in control_type.choices} & options.keys()
         parameters = [
             f"{instance}.{parameter.name}"
-            for parameter in control_type.declared(options)
+            for parameter in control_type.declare_parameters(options)
         ]
         if choices and all(name in grid for name in parameters):
             controls[instance] = {
@@ -216,7 +216,7 @@ def keep_choices(
     return controls
 
 
-def is_drawn(config: SweepConfig, factor: str) -> bool:
+def is_sampled(config: SweepConfig, factor: str) -> bool:
     """Return whether a sweep samples a parameter from a range that can be set."""
     instance, dot, parameter = factor.partition(".")
     is_frame = bool(config.path) and parameter == "time"
@@ -240,7 +240,7 @@ def find_names(config: SweepConfig, setting: str, value: str) -> list[str]:
     return matching or list(names[:1])
 
 
-def make_quiet(config: SweepConfig, **changes: object) -> SweepConfig:
+def make_minimal_config(config: SweepConfig, **changes: object) -> SweepConfig:
     """Return changed settings of a sweep that only renders and predicts."""
     quiet = {
         "trials": 0,
@@ -250,4 +250,4 @@ def make_quiet(config: SweepConfig, **changes: object) -> SweepConfig:
         "surface": False,
     }
     sampler = {} if changes.get("controls") else {"sampler": "sobol"}
-    return SweepConfig(**{**config.plain(), **quiet, **changes, **sampler})
+    return SweepConfig(**{**config.to_json(), **quiet, **changes, **sampler})

@@ -5,7 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from advsearch.extend import RunContext, experiment
-from advsearch.questions.harden.result import HardenConfig, HardenResult, claims, shown
+from advsearch.questions.harden.result import (
+    HardenConfig,
+    HardenResult,
+    make_harden_claims,
+    make_harden_view,
+)
 
 
 @experiment(
@@ -15,8 +20,8 @@ from advsearch.questions.harden.result import HardenConfig, HardenResult, claims
     positional_args=("model",),
     python_arguments="advsearch.questions.harden.carry_out:run_hardening",
     resumes_in_python=True,
-    view=shown,
-    claims=claims,
+    view=make_harden_view,
+    claims=make_harden_claims,
 )
 def harden(context: RunContext[HardenConfig], **arguments: Any) -> HardenResult:
     """Train a copy of a model on its worst cases (docs/harden.md).

@@ -24,13 +24,13 @@ from advsearch.extend import (
 )
 from advsearch.questions.harden import scenes
 from advsearch.questions.harden.detectors import (
-    DetectorCourse,
+    DetectorTrainer,
     Loss,
-    SegmenterCourse,
+    SegmenterTrainer,
     read_coco,
 )
-from advsearch.questions.harden.lessons import PICTURES
-from advsearch.questions.harden.networks import trainable
+from advsearch.questions.harden.lessons import IMAGE_DIRECTORY
+from advsearch.questions.harden.networks import make_trainable
 from advsearch.questions.harden.result import (
     HardenConfig,
     HardenedControl,
@@ -38,16 +38,21 @@ from advsearch.questions.harden.result import (
     Share,
     SplitSide,
 )
-from advsearch.questions.harden.rounds import WEIGHTS, Course, MakeOptimiser, Rounds
+from advsearch.questions.harden.rounds import (
+    WEIGHTS_FILE,
+    MakeOptimizer,
+    Rounds,
+    Trainer,
+)
 from advsearch.questions.harden.scenes import (
     FURTHER,
     HELD_OUT,
     ROBUST,
     TRAINING,
     VALIDATION,
-    SceneWork,
+    SceneJobs,
 )
-from advsearch.questions.harden.training import ClassifierCourse, Examples
+from advsearch.questions.harden.training import ClassifierTrainer, Examples
 
 ARGUMENTS_NOTE = "means"
 """Note of a run: which arguments that only Python can pass it has."""
@@ -63,10 +68,10 @@ A stronger search also names the usual one: where that has found a wrong predict
 the stronger one is not run.
 """
 
-COURSES: Mapping[str, Callable[..., Course]] = {
-    "classification": ClassifierCourse,
-    "detection": DetectorCourse,
-    "segmentation": SegmenterCourse,
+TRAINERS: Mapping[str, Callable[..., Trainer]] = {
+    "classification": ClassifierTrainer,
+    "detection": DetectorTrainer,
+    "segmentation": SegmenterTrainer,
 }
 
 
@@ -74,7 +79,7 @@ def run_hardening(
     context: RunContext[HardenConfig],
     *,
     model: Any = None,
-    optimiser: MakeOptimiser | None = None,
+    optimiser: MakeOptimizer | None = None,
     beside: Examples | None = None,
     loss: Loss | None = None,
 ) -> HardenResult:
@@ -90,27 +95,27 @@ def run_hardening(
     workbench.check_run_settings(config)
     check_settings(config, beside, loss)
     loaded, warnings = load_task_model(config, model)
-    splits = scenes.splits_of(config, loaded)
-    work = SceneWork(config, loaded, splits, context.progress)
+    splits = scenes.make_splits(config, loaded)
+    work = SceneJobs(config, loaded, splits, context.progress)
 
     is_classifier = config.task_name == "classification"
-    student = trainable(loaded, config.layers, logits=is_classifier)
+    student = make_trainable(loaded, config.layers, logits=is_classifier)
     python_arguments: dict[str, Any] = {"loss": loss}
     if is_classifier:
         python_arguments = {"beside": beside}
     course_arguments = dict(python_arguments)
     if config.data:
         course_arguments["custom_items"] = read_coco(Path(config.data), loaded)
-    course = COURSES[config.task_name](work, student, optimiser, **course_arguments)
+    course = TRAINERS[config.task_name](work, student, optimiser, **course_arguments)
     check_same_arguments(context.run, {"optimiser": optimiser, **python_arguments})
-    workbench.check_made_of(context.run, [loaded])
+    workbench.check_digests(context.run, [loaded])
 
     hardening = Hardening(context.run, course)
     worker = "advsearch.questions.harden.scenes:load_scene_work"
     with context.until_interrupted():
-        with workbench.executor_for(config, worker, context.progress) as work.executor:
-            hardening.carry_out(context)
-    return hardening.result(context, warnings)
+        with workbench.open_executor(config, worker, context.progress) as work.executor:
+            hardening.execute(context)
+    return hardening.make_result(context, warnings)
 
 
 def check_settings(
@@ -124,7 +129,7 @@ def check_settings(
     task_name = config.task_name
     is_classifier = task_name == "classification"
     uses_data_or_loss = bool(config.data or loss)
-    if task_name not in COURSES or (is_classifier and uses_data_or_loss):
+    if task_name not in TRAINERS or (is_classifier and uses_data_or_loss):
         raise InputError(
             "task: harden trains for classification, detection and segmentation; "
             "`data` is of detection, and `loss` of both of the others"
@@ -190,34 +195,34 @@ class Hardening:
     """A run that measures a model, trains it, and measures it again.
 
     Attributes:
-        wrong: whether a search found a wrong prediction, by the kind of the row, which
+        is_wrong: whether a search found a wrong prediction, by the kind of the row, which
             is a measurement and a control, and the number of the scene.
-        clean: whether each plain image of a held-out scene is right, "before" and
+        clean_is_right: whether each plain image of a held-out scene is right, "before" and
             "after".
         outcomes: counts of what becomes of the object in the others, likewise.
-        counts: number of scenes by split.
+        n_scenes: number of scenes by split.
     """
 
-    def __init__(self, run: RunDirectory, course: Course) -> None:
+    def __init__(self, run: RunDirectory, trainer: Trainer) -> None:
         self.run = run
-        self.course = course
-        self.scenes = course.work
-        self.config = course.config
-        self.rounds = Rounds(run, course)
-        self.wrong = {
+        self.trainer = trainer
+        self.scenes = trainer.work
+        self.config = trainer.config
+        self.rounds = Rounds(run, trainer)
+        self.is_wrong = {
             (row.kind, row.step): bool(row.success) for row in run.store.rows()
         }
-        self.clean: Mapping[str, list[bool]] = {}
+        self.clean_is_right: Mapping[str, list[bool]] = {}
         self.outcomes: Mapping[str, dict[str, int]] = {}
         n_training = self.config.scenes * self.config.rounds
-        self.counts = {
+        self.n_scenes = {
             TRAINING: n_training,
-            FURTHER: course.further * n_training,
-            VALIDATION: self.rounds.judged,
+            FURTHER: trainer.n_further_scenes * n_training,
+            VALIDATION: self.rounds.n_validation_scenes,
             HELD_OUT: scenes.CLEAN_SCENES * self.config.measured,
         }
 
-    def carry_out(self, context: RunContext[HardenConfig]) -> None:
+    def execute(self, context: RunContext[HardenConfig]) -> None:
         """Measure the model, train it, and measure it again.
 
         Whatever an earlier session of the run has done is not done again.
@@ -233,8 +238,8 @@ class Hardening:
             for measurement in MEASUREMENTS:
                 if measurement == "after":
                     stages.begin("training", "training")
-                    self.rounds.carry_out()
-                    weights = (self.run.path / WEIGHTS).read_bytes()
+                    self.rounds.execute()
+                    weights = (self.run.path / WEIGHTS_FILE).read_bytes()
                 if "stronger" not in measurement:
                     stages.begin("measurement", MEASUREMENTS[measurement][0])
                 self._measure(measurement, weights or None)
@@ -246,11 +251,11 @@ class Hardening:
     def _evaluate_plain_images(self, weights: bytes) -> None:
         """Evaluate both models on plain images of the held-out scenes."""
         jobs = [
-            partial(SceneWork.looked_at, number=number, weights=weights)
-            for number in range(self.counts[HELD_OUT])
+            partial(SceneJobs.evaluate_plain_images, number=number, weights=weights)
+            for number in range(self.n_scenes[HELD_OUT])
         ]
         title = "looking at plain pictures of held-out scenes"
-        evaluations = [value for _, value in self.scenes.each(title, jobs)]
+        evaluations = [value for _, value in self.scenes.run_jobs(title, jobs)]
         clean = {}
         outcomes = {}
         for when in ("before", "after"):
@@ -261,7 +266,7 @@ class Hardening:
             for evaluation in evaluations:
                 outcome_counts.update(evaluation.get(f"outcomes {when}", ()))
             outcomes[when] = dict(outcome_counts)
-        self.clean = clean
+        self.clean_is_right = clean
         self.outcomes = outcomes
 
     def _measure(self, measurement: str, weights: bytes | None) -> None:
@@ -277,22 +282,22 @@ class Hardening:
             for number, control in product(
                 range(self.config.measured), self.config.controls
             )
-            if (f"{measurement} {control}", number) not in self.wrong
+            if (f"{measurement} {control}", number) not in self.is_wrong
         ]
         # What the usual search has found is not searched again by the stronger one.
         found = [
             (control, number)
             for control, number in keys
-            if usual and self.wrong[f"{usual} {control}", number]
+            if usual and self.is_wrong[f"{usual} {control}", number]
         ]
         to_attack = [key for key in keys if key not in found]
         for control, number in found:
             self._record(measurement, control, number, True)
 
-        times = scenes.TIMES if usual else 1
+        times = scenes.STRONGER_STEPS_FACTOR if usual else 1
         jobs = [
             partial(
-                SceneWork.attacked,
+                SceneJobs.attack_held_out,
                 times=times,
                 weights=weights,
                 control=control,
@@ -301,7 +306,7 @@ class Hardening:
             for control, number in to_attack
         ]
         hint = "`measured` and `steps` shorten it"
-        for index, status in self.scenes.each(title, jobs, hint=hint):
+        for index, status in self.scenes.run_jobs(title, jobs, hint=hint):
             control, number = to_attack[index]
             self._record(measurement, control, number, status != ROBUST)
 
@@ -310,7 +315,7 @@ class Hardening:
     ) -> None:
         """Store whether an attack found a wrong prediction in a scene."""
         kind = f"{measurement} {control}"
-        self.wrong[kind, number] = is_wrong
+        self.is_wrong[kind, number] = is_wrong
         self.run.record_row(
             kind,
             number,
@@ -327,7 +332,7 @@ class Hardening:
         is_robust = []
         for number in range(self.config.measured):
             is_wrong = [
-                self.wrong.get((f"{measurement} {control}", number))
+                self.is_wrong.get((f"{measurement} {control}", number))
                 for control in controls
             ]
             if None in is_wrong:
@@ -335,7 +340,7 @@ class Hardening:
             is_robust.append(not any(is_wrong))
         return is_robust
 
-    def result(
+    def make_result(
         self, context: RunContext[HardenConfig], warnings: list[str]
     ) -> HardenResult:
         """Return the result of the run, as far as it is measured."""
@@ -352,18 +357,18 @@ class Hardening:
             training_round.model_copy(
                 update={"kept": is_done and number == self.rounds.best}
             )
-            for number, training_round in enumerate(self.rounds.done)
+            for number, training_round in enumerate(self.rounds.results)
         ]
         training_split = self.scenes.splits[TRAINING]
         facts = self.scenes.executor and self.scenes.executor.facts
-        weights_path = self.run.path / WEIGHTS
+        weights_path = self.run.path / WEIGHTS_FILE
         return context.result(
             HardenResult,
             **_compare_robustness(before, after),
             environment=",".join(training_split.environments),
             objects=list(training_split.objects),
-            before=_share(before),
-            after=_share(after),
+            before=make_share(before),
+            after=make_share(after),
             clean_before=self._clean_share("before"),
             clean_after=self._clean_share("after"),
             table=self._control_rows(),
@@ -371,24 +376,26 @@ class Hardening:
             rounds=rounds,
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search="portfolio of pgd with restarts, cmaes and random, "
-            f"{scenes.TIMES * config.steps} steps",
+            f"{scenes.STRONGER_STEPS_FACTOR * config.steps} steps",
             hardened=self._hardened_name() if is_done else None,
             weights=str(weights_path) if is_done else None,
-            pictures=str(self.run.path / PICTURES) if is_done else None,
+            pictures=str(self.run.path / IMAGE_DIRECTORY) if is_done else None,
             shared=results.SharedWork.of_facts(facts, facts.machines if facts else {}),
             warnings=warnings,
             seconds=context.stages.seconds,
         )
 
     def _clean_share(self, when: str) -> Share | None:
-        return _share(self.clean.get(when), scenes.CLEAN_VIEWS, self.outcomes.get(when))
+        return make_share(
+            self.clean_is_right.get(when), scenes.CLEAN_VIEWS, self.outcomes.get(when)
+        )
 
     def _control_rows(self) -> list[HardenedControl]:
         """Return the robustness to each control that is measured."""
         rows = []
         for control in self.config.controls:
             shares = {
-                measurement: _share(self._robust(measurement, [control]))
+                measurement: make_share(self._robust(measurement, [control]))
                 for measurement in MEASUREMENTS
             }
             if None not in shares.values():
@@ -397,7 +404,7 @@ class Hardening:
 
     def _split_rows(self) -> dict[str, SplitSide]:
         """Describe the parts of the split."""
-        training_views, validation_views = self.course.views
+        training_views, validation_views = self.trainer.n_views
         n_views = {
             TRAINING: training_views,
             FURTHER: 1,
@@ -406,7 +413,7 @@ class Hardening:
         }
         return {
             name: SplitSide.of(
-                {**vars(split), "scenes": self.counts[name], "views": n_views[name]}
+                {**vars(split), "scenes": self.n_scenes[name], "views": n_views[name]}
             )
             for name, split in self.scenes.splits.items()
         }
@@ -416,7 +423,7 @@ class Hardening:
         name = self.config.model.partition("@")[0].strip()
         # A name with a colon is of code that makes the model.
         if name == "reference" or ":" in name:
-            return f"{name}@{self.run.path / WEIGHTS}"
+            return f"{name}@{self.run.path / WEIGHTS_FILE}"
         return None
 
 
@@ -436,29 +443,29 @@ def _compare_robustness(
     }
 
 
-def _share(
-    right: Sequence[bool] | None,
+def make_share(
+    is_right: Sequence[bool] | None,
     views: int = 1,
     outcomes: Mapping[str, int] | None = None,
 ) -> Share | None:
     """Return the fraction of right images with its interval over scenes.
 
     Args:
-        right: whether each image is right (scenes * views), all views of a scene after
+        is_right: whether each image is right (scenes * views), all views of a scene after
             each other; None if they are not measured.
         views: images of each scene, which are not independent.
         outcomes: counts of what becomes of the object in the others.
     """
-    if right is None:
+    if is_right is None:
         return None
     right_views = [
-        sum(right[start : start + views]) for start in range(0, len(right), views)
+        sum(is_right[start : start + views]) for start in range(0, len(is_right), views)
     ]
     n_views = [views] * len(right_views)
     return Share(
-        accuracy=sum(right) / len(right),
-        interval=statistics.clustered.share_interval(right_views, n_views),
-        right=sum(right),
-        count=len(right),
+        accuracy=sum(is_right) / len(is_right),
+        interval=statistics.clustered.rate_interval(right_views, n_views),
+        right=sum(is_right),
+        count=len(is_right),
         outcomes=dict(outcomes or {}) or None,
     )

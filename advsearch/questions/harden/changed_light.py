@@ -21,7 +21,7 @@ WHITE_LIGHT_CHANGES = 0.5
 """Probability that the color of light is changed."""
 
 
-def varied(
+def vary_environment(
     environment: assets.EnvironmentAsset, rng: np.random.Generator
 ) -> assets.EnvironmentAsset:
     """Mirror an environment, change its tint and contrast, and add a soft light.
@@ -62,7 +62,7 @@ def sample_lobe(
     return np.asarray(lobe)
 
 
-def white_light_changed(
+def change_white_light(
     environment: assets.EnvironmentAsset, rng: np.random.Generator
 ) -> assets.EnvironmentAsset:
     """Change the color temperature of an environment in half of the cases.

@@ -32,10 +32,15 @@ from advsearch.extend import (
     stored_files,
     workbench,
 )
-from advsearch.questions.harden.lessons import PICTURES
+from advsearch.questions.harden.lessons import IMAGE_DIRECTORY
 from advsearch.questions.harden.networks import Trainable
-from advsearch.questions.harden.rounds import Course, MakeOptimiser, Score, Take
-from advsearch.questions.harden.scenes import SceneWork
+from advsearch.questions.harden.rounds import (
+    ComputeGradient,
+    MakeOptimizer,
+    Score,
+    Trainer,
+)
+from advsearch.questions.harden.scenes import SceneJobs
 
 Target = dict[str, Tensor]
 """What is in a picture: "boxes" (K, 4), x0, y0, x1, y1 in pixels of the network's
@@ -70,7 +75,7 @@ class Example(NamedTuple):
         task: evaluates predictions of a rendered image; None for a custom image.
         truth: ground truth for the task: a `Place` of detection, or a `Region` of
             segmentation.
-        found: whether a search has found it.
+        is_adversarial: whether a search has found it.
     """
 
     levels: Tensor
@@ -78,18 +83,18 @@ class Example(NamedTuple):
     labels: Tensor
     task: Task | None = None
     truth: Any = None
-    found: bool = False
+    is_adversarial: bool = False
 
     @classmethod
-    def of(cls, problem: Problem, seed: int, u: Tensor | None = None) -> Example:
+    def render(cls, problem: Problem, seed: int, u: Tensor | None = None) -> Example:
         """Render a configuration, or the plain scene, under conditions of a seed."""
         configuration = problem.domain.start if u is None else u
-        truth: Any = problem.truth(problem.whole(configuration, seed))
+        truth: Any = problem.find_truth(problem.add_conditions(configuration, seed))
         box = getattr(truth, "box", None)
         boxes = torch.tensor([box] if box else [], dtype=torch.float32).reshape(-1, 4)
         labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
         return cls(
-            color.levels_of(problem.picture(configuration, seed, SPP)),
+            color.to_uint8(problem.picture(configuration, seed, SPP)),
             boxes,
             labels,
             problem.task,
@@ -97,7 +102,7 @@ class Example(NamedTuple):
             u is not None,
         )
 
-    def right(self, model: Model) -> bool:
+    def is_right(self, model: Model) -> bool:
         """Return whether a model is right about a rendered image."""
         assert self.task is not None
         with torch.no_grad():
@@ -105,7 +110,7 @@ class Example(NamedTuple):
             return bool(self.task.loss(output, self.truth)[0] <= 0.0)
 
 
-def read_coco(folder: Path, model: Model) -> list[Example]:
+def read_coco(directory: Path, model: Model) -> list[Example]:
     """Read the images of a directory that `export --format coco` has written.
 
     It has `annotations.json` and `images/`. Categories that are no label of the model
@@ -115,8 +120,8 @@ def read_coco(folder: Path, model: Model) -> list[Example]:
         FileFormatError: it is something else, or names files outside of it.
         InputError: no category is a label of the model.
     """
-    path = folder / "annotations.json"
-    image_directory = (folder / "images").resolve()
+    path = directory / "annotations.json"
+    image_directory = (directory / "images").resolve()
     try:
         coco: Any = stored_files.parse_json(
             stored_files.read_text(path, "a COCO file", MAX_BYTES)
@@ -154,7 +159,7 @@ def read_coco(folder: Path, model: Model) -> list[Example]:
                 ],
                 dtype=torch.int64,
             )
-            examples.append(Example(color.levels_of(pixels), boxes, labels))
+            examples.append(Example(color.to_uint8(pixels), boxes, labels))
         return examples
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise errors.FileFormatError(
@@ -183,7 +188,9 @@ def _locate_image(directory: Path, name: str, coco_file: Path) -> Path:
     return file
 
 
-def own_loss(network: nn.Module, x: Tensor, targets: Sequence[Target]) -> Tensor:
+def compute_network_loss(
+    network: nn.Module, x: Tensor, targets: Sequence[Target]
+) -> Tensor:
     """Return the loss that a network computes itself in training.
 
     Networks of torchvision take lists of images and targets, those of transformers take
@@ -235,34 +242,36 @@ def _transformers_labels(
     return labels
 
 
-class DetectorCourse(Course):
+class DetectorTrainer(Trainer):
     """Train a detector on adversarial images, plain images and custom examples.
 
     Searches attack the student as it is at the start of the round. Images are mirrored
     half of the time. Statistics of batch normalization are not updated.
     """
 
-    batch = 8
+    batch_size = 8
     weight_decay = 1e-4
-    warm_up = 0.3
-    views = (N_VIEWS, N_VIEWS)
+    warm_up_fraction = 0.3
+    n_views = (N_VIEWS, N_VIEWS)
 
     def __init__(
         self,
-        work: SceneWork,
+        work: SceneJobs,
         student: Trainable,
-        optimiser: MakeOptimiser | None = None,
+        optimiser: MakeOptimizer | None = None,
         custom_items: Sequence[Example] = (),
         loss: Loss | None = None,
     ) -> None:
         super().__init__(work, student, optimiser, custom_items)
-        self.loss = loss or self.usual_loss()
+        self.loss = loss or self.default_loss()
 
-    def usual_loss(self) -> Loss:
+    def default_loss(self) -> Loss:
         """Return the loss that is used if the caller passes none."""
-        return own_loss
+        return compute_network_loss
 
-    def draw(self, title: str, split: str, places: range) -> list[Example]:
+    def sample_items(
+        self, title: str, split: str, scene_numbers: range
+    ) -> list[Example]:
         """Return plain images of scenes, then the worst one that each search finds.
 
         There is a search for each control; its image is used whether the prediction is
@@ -272,9 +281,9 @@ class DetectorCourse(Course):
         controls = tuple(self.config.controls)
         plain = list[Example]()
         worst = list[Example]()
-        self.work.progress.stage(title, len(places) * len(controls))
-        for number in places:
-            name, scene = scene_split.scene(number)
+        self.work.progress.stage(title, len(scene_numbers) * len(controls))
+        for number in scene_numbers:
+            name, scene = scene_split.load_scene(number)
             for control in controls:
                 seed = seeds.stream(scene_split.seed, f"search {control}", number)
                 plain_image, worst_image = self._attack(scene, name, control, seed)
@@ -282,9 +291,9 @@ class DetectorCourse(Course):
                 worst.append(worst_image)
                 self.work.progress.advance(1)
             # Further views vary in what the last control does not search.
-            problem, _ = self.work.problem(scene_split, number, controls[-1:])
+            problem, _ = self.work.make_problem(scene_split, number, controls[-1:])
             plain += [
-                Example.of(problem, seeds.stream(seed, "plain", view))
+                Example.render(problem, seeds.stream(seed, "plain", view))
                 for view in range(1, N_VIEWS)
             ]
         return plain + worst
@@ -294,22 +303,22 @@ class DetectorCourse(Course):
     ) -> tuple[Example, Example]:
         """Attack the student in a scene; return a plain image and the worst one."""
         model = self.student.model
-        config = self.work.attack(
+        config = self.work.make_attack_config(
             (control,), name, seed=seed, trials=TRIALS, verify_spp=SPP
         )
         u = workbench.attack_on(config, scene, model).u
-        problem = workbench.problem_of(config, scene, model, differentiated=False)
-        plain = Example.of(problem, seeds.stream(seed, "plain", 0))
-        worst = Example.of(problem, seeds.stream(seed, "worst", 0), u)
+        problem = workbench.make_problem_on(config, scene, model, differentiated=False)
+        plain = Example.render(problem, seeds.stream(seed, "plain", 0))
+        worst = Example.render(problem, seeds.stream(seed, "worst", 0), u)
         return plain, worst
 
-    def looks(self, item: Example) -> int:
-        return WORST_LOOKS if item.found else 1
+    def uses_per_epoch(self, item: Example) -> int:
+        return WORST_LOOKS if item.is_adversarial else 1
 
     @contextmanager
-    def gradients(self, new: Sequence[Example]) -> Iterator[Take]:
+    def gradient_context(self, new: Sequence[Example]) -> Iterator[ComputeGradient]:
         """Return a context in which gradients are computed in training mode."""
-        network = self.student.net.train()
+        network = self.student.network.train()
         for module in network.modules():
             if isinstance(module, (_BatchNorm, nn.Dropout)):
                 module.eval()
@@ -321,7 +330,7 @@ class DetectorCourse(Course):
             targets = list[Target]()
             for item in batch:
                 is_mirrored = bool(rng.random() < 0.5)
-                x, target = self.shown(item, is_mirrored)
+                x, target = self.make_input(item, is_mirrored)
                 inputs.append(x)
                 targets.append(target)
             network.zero_grad()
@@ -330,12 +339,12 @@ class DetectorCourse(Course):
         yield compute_gradient
         network.eval()
 
-    def shown(self, item: Example, mirrored: bool) -> tuple[Tensor, Target]:
+    def make_input(self, item: Example, is_mirrored: bool) -> tuple[Tensor, Target]:
         """Return the network's input for an image, and the target in its pixels."""
         levels = item.levels
         boxes = item.boxes
         height, width = item.levels.shape[:2]
-        if mirrored:
+        if is_mirrored:
             levels = levels.flip(1)
             boxes = torch.stack(
                 [width - boxes[:, 2], boxes[:, 1], width - boxes[:, 0], boxes[:, 3]],
@@ -343,7 +352,7 @@ class DetectorCourse(Course):
             )
         rows, columns = self.student.model.input_size
         scale = torch.tensor([columns / width, rows / height] * 2)
-        x = self.student.model.prepared(levels[None] / 255.0)[:1]
+        x = self.student.model.prepare(levels[None] / 255.0)[:1]
         return x, {
             "boxes": (boxes * scale).to(x.device),
             "labels": item.labels.to(x.device),
@@ -354,19 +363,21 @@ class DetectorCourse(Course):
         plain = []
         worst = []
         for item in held_back:
-            is_right = item.right(self.student.model)
-            if item.found:
+            is_right = item.is_right(self.student.model)
+            if item.is_adversarial:
                 worst.append(is_right)
             else:
                 plain.append(is_right)
         return Score(float(np.mean(plain)), float(np.mean(worst)))
 
-    def save(self, run: RunDirectory, number: int, new: Sequence[Example]) -> None:
+    def save_images(
+        self, run: RunDirectory, number: int, new: Sequence[Example]
+    ) -> None:
         """Write the images of a round in COCO's format."""
-        directory = f"{PICTURES}/round-{number:03d}"
+        directory = f"{IMAGE_DIRECTORY}/round-{number:03d}"
         images = []
         annotations = list[dict[str, Any]]()
-        written_items = written(run, f"{directory}/images", new)
+        written_items = write_images(run, f"{directory}/images", new)
         for image_id, (item, name) in enumerate(written_items, start=1):
             height, width = item.levels.shape[:2]
             images.append(
@@ -412,8 +423,8 @@ def _annotate(
     }
 
 
-def written(
-    run: RunDirectory, folder: str, items: Sequence[Example]
+def write_images(
+    run: RunDirectory, directory: str, items: Sequence[Example]
 ) -> Iterator[tuple[Example, str]]:
     """Write the images of items into a directory of the run.
 
@@ -421,9 +432,9 @@ def written(
         Each item with the name of its image, without ".png".
     """
     for number, item in enumerate(items, 1):
-        (run.path / folder).mkdir(parents=True, exist_ok=True)
-        name = f"{number:05d}-{'worst' if item.found else 'plain'}"
-        run.save_image(name, item.levels / 255.0, folder)
+        (run.path / directory).mkdir(parents=True, exist_ok=True)
+        name = f"{number:05d}-{'worst' if item.is_adversarial else 'plain'}"
+        run.save_image(name, item.levels / 255.0, directory)
         yield item, name
 
 
@@ -431,45 +442,47 @@ def written(
 # ----------------------------------------------------------------------------------
 
 
-class SegmenterCourse(DetectorCourse):
+class SegmenterTrainer(DetectorTrainer):
     """Train a segmenter on adversarial and plain images.
 
     The object's pixels are of its class. All others keep the class that the original
     model predicts, since what they show is not known.
     """
 
-    def usual_loss(self) -> Loss:
+    def default_loss(self) -> Loss:
         task = workbench.make_task(self.config.task)
-        return partial(pixel_loss, task)
+        return partial(compute_pixel_loss, task)
 
-    def shown(self, item: Example, mirrored: bool) -> tuple[Tensor, Target]:
+    def make_input(self, item: Example, is_mirrored: bool) -> tuple[Tensor, Target]:
         """Return the network's input for an image, and the target of its pixels.
 
         The target has "classes" (h, w) int64 and "object" (h, w) bool at the size of
         the network's output.
         """
         region: Any = item.truth
-        levels = item.levels.flip(1) if mirrored else item.levels
+        levels = item.levels.flip(1) if is_mirrored else item.levels
         with torch.no_grad():
             classes = self.work.model(levels[None] / 255.0)[0].argmax(dim=0)
         object_mask = region.at(tuple(classes.shape)).to(classes.device)
-        if mirrored:
+        if is_mirrored:
             object_mask = object_mask.flip(1)
-        x = self.student.model.prepared(levels[None] / 255.0)[:1]
+        x = self.student.model.prepare(levels[None] / 255.0)[:1]
         return x, {
             "classes": torch.where(object_mask, region.labels[0], classes).to(x.device),
             "object": object_mask.to(x.device),
         }
 
-    def save(self, run: RunDirectory, number: int, new: Sequence[Example]) -> None:
+    def save_images(
+        self, run: RunDirectory, number: int, new: Sequence[Example]
+    ) -> None:
         """Write the images of a round, and the masks of their objects."""
-        directory = f"{PICTURES}/round-{number:03d}"
-        for item, name in written(run, directory, new):
+        directory = f"{IMAGE_DIRECTORY}/round-{number:03d}"
+        for item, name in write_images(run, directory, new):
             mask = item.truth.mask[..., None].float().expand(-1, -1, 3)
             run.save_image(f"{name}-mask", mask, directory)
 
 
-def pixel_loss(
+def compute_pixel_loss(
     task: Task, network: nn.Module, x: Tensor, targets: Sequence[Target]
 ) -> Tensor:
     """Return the loss of a segmenter.

@@ -35,17 +35,17 @@ from advsearch.extend import (
     writing,
 )
 
-PICTURES = "artifacts/pictures"
+IMAGE_DIRECTORY = "artifacts/pictures"
 """Directory of the training's images in the run."""
 SPP = 2
 """Samples per pixel of an image; many lessons with noise teach more than few without."""
 MATRIX_SPP = 4
 """Samples per pixel of a matrix of light transport."""
-DEPTH = 4
+MAX_DEPTH = 4
 """Segments of the longest light path."""
-STEP = 0.5
+STEP_FRACTION = 0.5
 """Step of an adversarial texture, as a fraction of its budget."""
-TOGETHER = 32
+BATCH_SIZE = 32
 """Batch size of the model's predictions."""
 
 
@@ -58,23 +58,23 @@ class Lesson:
     """One scene under sampled conditions, with its plain image.
 
     Attributes:
-        right: indices of the right classes.
+        right_classes: indices of the right classes.
         levels: the image (H, W, 3) uint8, to save memory. Of a scene that is rendered
             twice it is the one with a single control changed.
     """
 
-    right: tuple[int, ...]
+    right_classes: tuple[int, ...]
     levels: Tensor
 
     @property
-    def plain(self) -> Tensor:
+    def plain_image(self) -> Tensor:
         """The image of `levels` (H, W, 3), sRGB in [0, 1]."""
         return self.levels / 255.0
 
     @property
-    def worst(self) -> Tensor:
+    def worst_image(self) -> Tensor:
         """The worst image that is known (H, W, 3), sRGB in [0, 1]."""
-        return self.plain
+        return self.plain_image
 
 
 @dataclass(eq=False)
@@ -85,7 +85,7 @@ class TextureLesson(Lesson):
         space: maps configurations to textures.
         domain: the configurations that are allowed.
         linear: computes the image of a texture; it no longer holds the scene.
-        numbers: the sampled conditions that it was made for.
+        conditions: the sampled conditions that it was made for.
         texture: the adversarial configuration (d,). Other views may share it, and it is
             changed in place.
     """
@@ -93,20 +93,22 @@ class TextureLesson(Lesson):
     space: Any
     domain: policies.Domain
     linear: Any
-    numbers: Tensor
+    conditions: Tensor
     texture: Tensor
 
-    def picture(self, u: Tensor) -> Tensor:
+    def compute_image(self, u: Tensor) -> Tensor:
         """Return the image (H, W, 3) of a texture, with a graph."""
         inputs = self.space.inputs(u)
         texture_inputs = {name: inputs[name] for name in self.linear.there}
-        image: Tensor = self.linear.shown(texture_inputs, torch.cat([u, self.numbers]))
+        image: Tensor = self.linear.shown(
+            texture_inputs, torch.cat([u, self.conditions])
+        )
         return image
 
     @property
-    def worst(self) -> Tensor:
+    def worst_image(self) -> Tensor:
         with torch.no_grad():
-            return color.to_8_bit(self.picture(self.texture))
+            return color.round_to_8_bit(self.compute_image(self.texture))
 
 
 @dataclass(eq=False)
@@ -114,67 +116,71 @@ class RenderedLesson(Lesson):
     """A lesson with images of random configurations.
 
     Attributes:
-        pictures: the images (N, H, W, 3) uint8.
+        images: the images (N, H, W, 3) uint8.
         losses: the loss of each image (N,) when it was last evaluated; infinite before.
     """
 
-    pictures: Tensor
+    images: Tensor
     losses: Tensor
 
     @classmethod
-    def of(
-        cls, right: tuple[int, ...], plain: Tensor, pictures: Tensor
+    def create(
+        cls, right: tuple[int, ...], plain: Tensor, images: Tensor
     ) -> RenderedLesson:
         """Create a lesson whose first image is the worst so far.
 
         Args:
             right: indices of the right classes.
             plain: the plain image (H, W, 3) in [0, 1].
-            pictures: the other images (N, H, W, 3) in [0, 1].
+            images: the other images (N, H, W, 3) in [0, 1].
         """
         return cls(
             right,
-            color.levels_of(plain),
-            color.levels_of(pictures),
-            torch.full((len(pictures),), torch.inf),
+            color.to_uint8(plain),
+            color.to_uint8(images),
+            torch.full((len(images),), torch.inf),
         )
 
     @property
-    def worst(self) -> Tensor:
-        return self.pictures[int(self.losses.argmax())] / 255.0
+    def worst_image(self) -> Tensor:
+        return self.images[int(self.losses.argmax())] / 255.0
 
 
-def lessons(
+def make_lessons(
     problem: Problem,
-    views: int,
+    n_views: int,
     seed: int,
     *,
-    plain: int = 0,
-    tries: int | None = None,
-    shared: bool = False,
+    n_plain: int = 0,
+    n_tries: int | None = None,
+    shares_texture: bool = False,
 ) -> list[Lesson]:
     """Make lessons from views of one scene, each with its own sampled conditions.
 
     Args:
         problem: the scene with the controls that make it harder.
-        views: that have worst images.
+        n_views: that have worst images.
         seed: root of the samples.
-        plain: further views without worst images.
-        tries: random configurations of each view that are rendered where a matrix of
-            light transport does not give the images (see `tried`). None renders each
+        n_plain: further views without worst images.
+        n_tries: random configurations of each view that are rendered where a matrix of
+            light transport does not give the images (see `sample_configurations`). None renders each
             view twice: with a single control changed, and with all of them.
-        shared: whether the views have one adversarial texture.
+        shares_texture: whether the views have one adversarial texture.
     """
-    has_matrix = bool(views) and problem.is_linear
-    right = tuple(int(index) for index in problem.truth())
-    render = problem.renderer.like(quick=True)
+    has_matrix = bool(n_views) and problem.is_linear
+    right = tuple(int(index) for index in problem.find_truth())
+    render = problem.renderer.copy_with(quick=True)
     all_lessons = list[Lesson]()
-    with torch.no_grad(), problem.renderer.scene.shorter(DEPTH):
+    with torch.no_grad(), problem.renderer.scene.limit_depth(MAX_DEPTH):
         if has_matrix:
-            all_lessons += _texture_lessons(problem, views, seed, right, shared)
+            all_lessons += _texture_lessons(
+                problem, n_views, seed, right, shares_texture
+            )
         else:
-            all_lessons += _rendered_lessons(problem, render, views, seed, right, tries)
-        all_lessons += _plain_lessons(problem, render, plain, seed, right)
+            all_lessons += _rendered_lessons(
+                problem, render, n_views, seed, right, n_tries
+            )
+        all_lessons += _plain_lessons(problem, render, n_plain, seed, right)
     return all_lessons
 
 
@@ -190,15 +196,15 @@ def _texture_lessons(
     texture_lessons = []
     for number in range(views):
         view_seed = seeds.stream(seed, "lesson", number)
-        configuration = problem.whole(domain.start, view_seed)
+        configuration = problem.add_conditions(domain.start, view_seed)
         # A clone does not keep the full configuration in memory.
         conditions = configuration[domain.dim :].clone()
-        linear = problem.linearised(configuration, view_seed, MATRIX_SPP)
-        levels = color.levels_of(linear(configuration))
+        linear = problem.make_linear_renderer(configuration, view_seed, MATRIX_SPP)
+        levels = color.to_uint8(linear(configuration))
         texture = shared_texture
         if not shared:
             texture = _sample_texture(domain, view_seed)
-        linear.let_go(full_space)
+        linear.release_scene(full_space)
         texture_lessons.append(
             TextureLesson(right, levels, space, domain, linear, conditions, texture)
         )
@@ -224,21 +230,28 @@ def _rendered_lessons(
     rendered_lessons = []
     for number in range(views):
         view_seed = seeds.stream(seed, "lesson", number)
-        conditions = problem.whole(domain.start, view_seed)[domain.dim :].clone()
+        conditions = problem.add_conditions(domain.start, view_seed)[
+            domain.dim :
+        ].clone()
         generator = torch.Generator().manual_seed(view_seed)
         if tries is None:
             n_controls = len(problem.searched_space.controls)
-            *single_changes, joint_change = tried(domain, generator, 1 + n_controls)
+            *single_changes, joint_change = sample_configurations(
+                domain, generator, 1 + n_controls
+            )
             index = torch.randint(len(single_changes), (), generator=generator)
             configurations = [single_changes[index], joint_change]
         else:
-            configurations = [domain.start, *tried(domain, generator, tries)]
+            configurations = [
+                domain.start,
+                *sample_configurations(domain, generator, tries),
+            ]
         plain_image, *images = (
             render(torch.cat([u, conditions]), seed=view_seed, spp=SPP)
             for u in configurations
         )
         rendered_lessons.append(
-            RenderedLesson.of(right, plain_image, torch.stack(images))
+            RenderedLesson.create(right, plain_image, torch.stack(images))
         )
     return rendered_lessons
 
@@ -250,13 +263,15 @@ def _plain_lessons(
     plain_lessons = []
     for number in range(views):
         view_seed = seeds.stream(seed, "plain lesson", number)
-        configuration = problem.whole(problem.domain.start, view_seed)
+        configuration = problem.add_conditions(problem.domain.start, view_seed)
         image = render(configuration, seed=view_seed, spp=SPP)
-        plain_lessons.append(Lesson(right, color.levels_of(image)))
+        plain_lessons.append(Lesson(right, color.to_uint8(image)))
     return plain_lessons
 
 
-def tried(domain: policies.Domain, generator: torch.Generator, count: int) -> Tensor:
+def sample_configurations(
+    domain: policies.Domain, generator: torch.Generator, count: int
+) -> Tensor:
     """Sample configurations (count, d) at random.
 
     In half of them each value is moved by chance to the nearer bound of its range, as
@@ -267,10 +282,14 @@ def tried(domain: policies.Domain, generator: torch.Generator, count: int) -> Te
     is_at_bound = (torch.rand(samples.shape, generator=generator) < 0.5) & (
         torch.rand(count, 1, generator=generator) < 0.5
     )
-    control_of_block = [block.name.rpartition(".")[0] for block, _ in domain.parts()]
+    control_of_block = [
+        block.name.rpartition(".")[0] for block, _ in domain.list_block_slices()
+    ]
     controls = list(dict.fromkeys(control_of_block))
     turn = torch.arange(count) % (len(controls) + 1)
-    for control, (block, columns) in zip(control_of_block, domain.parts(), strict=True):
+    for control, (block, columns) in zip(
+        control_of_block, domain.list_block_slices(), strict=True
+    ):
         if block.options or block.periodic:
             is_at_bound[:, columns] = False
         is_unchanged = (turn != controls.index(control)) & (turn != len(controls))
@@ -283,38 +302,46 @@ def tried(domain: policies.Domain, generator: torch.Generator, count: int) -> Te
     )
 
 
-def surprise(logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
+def negative_log_likelihood(
+    logits: Tensor, right_classes: Sequence[tuple[int, ...]]
+) -> Tensor:
     """Return the negative log-likelihood (N,) of any right class.
 
     Args:
         logits: (N, C).
-        right: indices of the right classes of each row.
+        right_classes: indices of the right classes of each row.
     """
     log_probabilities = F.log_softmax(logits, dim=1)
     return torch.stack(
         [
             -row[list(classes)].logsumexp(dim=0)
-            for row, classes in zip(log_probabilities, right, strict=True)
+            for row, classes in zip(log_probabilities, right_classes, strict=True)
         ]
     )
 
 
-def with_worst(some: Sequence[Lesson]) -> list[TextureLesson | RenderedLesson]:
+def select_hard_lessons(
+    candidates: Sequence[Lesson],
+) -> list[TextureLesson | RenderedLesson]:
     """Return the lessons that have worst images."""
     return [
-        lesson for lesson in some if isinstance(lesson, (TextureLesson, RenderedLesson))
+        lesson
+        for lesson in candidates
+        if isinstance(lesson, (TextureLesson, RenderedLesson))
     ]
 
 
-def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
+def search_worse_images(
+    selected: Sequence[Lesson], model: Model, steps: int = 1
+) -> None:
     """Search for worse images of lessons.
 
     Textures take steps of the search; where several images were rendered, their losses
     are computed again.
     """
-    for start in range(0, len(chosen), TOGETHER):
-        batch = chosen[start : start + TOGETHER]
-        ascend(batch, partial(slopes, model=model), steps)
+    for start in range(0, len(selected), BATCH_SIZE):
+        batch = selected[start : start + BATCH_SIZE]
+        ascend_textures(batch, partial(compute_texture_gradients, model=model), steps)
         _update_losses(batch, model)
 
 
@@ -323,26 +350,26 @@ def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
     rendered_lessons = [
         lesson
         for lesson in batch
-        if isinstance(lesson, RenderedLesson) and len(lesson.pictures) > 1
+        if isinstance(lesson, RenderedLesson) and len(lesson.images) > 1
     ]
     if not rendered_lessons:
         return
-    n_images = [len(lesson.pictures) for lesson in rendered_lessons]
+    n_images = [len(lesson.images) for lesson in rendered_lessons]
     right = []
     for lesson in rendered_lessons:
-        right += [lesson.right] * len(lesson.pictures)
+        right += [lesson.right_classes] * len(lesson.images)
     with torch.no_grad():
-        images = torch.cat([lesson.pictures for lesson in rendered_lessons]) / 255.0
-        losses = surprise(model(images), right)
+        images = torch.cat([lesson.images for lesson in rendered_lessons]) / 255.0
+        losses = negative_log_likelihood(model(images), right)
     for lesson, lesson_losses in zip(
         rendered_lessons, losses.split(n_images), strict=True
     ):
         lesson.losses = lesson_losses.clone()
 
 
-def ascend(
-    some: Sequence[Lesson],
-    slopes_of: Callable[[Sequence[TextureLesson]], Sequence[Tensor]],
+def ascend_textures(
+    selected: Sequence[Lesson],
+    gradients_of: Callable[[Sequence[TextureLesson]], Sequence[Tensor]],
     steps: int = 1,
 ) -> None:
     """Take steps of steepest ascent of the textures of lessons.
@@ -350,17 +377,19 @@ def ascend(
     The gradients of views that share a texture are summed. Other lessons are unchanged.
 
     Args:
-        some: the lessons.
-        slopes_of: returns the gradient of each lesson, as `slopes` does.
+        selected: the lessons.
+        gradients_of: returns the gradient of each lesson, as `compute_texture_gradients` does.
         steps: number of steps.
     """
-    texture_lessons = [lesson for lesson in some if isinstance(lesson, TextureLesson)]
+    texture_lessons = [
+        lesson for lesson in selected if isinstance(lesson, TextureLesson)
+    ]
     if not texture_lessons:
         return
     lesson_of_texture = {id(lesson.texture): lesson for lesson in texture_lessons}
     for _ in range(steps):
         gradient_of_texture = dict[int, Tensor]()
-        gradients = slopes_of(texture_lessons)
+        gradients = gradients_of(texture_lessons)
         for lesson, gradient in zip(texture_lessons, gradients, strict=True):
             texture_id = id(lesson.texture)
             gradient_of_texture[texture_id] = gradient + gradient_of_texture.get(
@@ -371,55 +400,57 @@ def ascend(
                 lesson.texture, gradient_of_texture[texture_id]
             )
             lesson.texture.copy_(
-                lesson.domain.project(lesson.texture + STEP * direction)
+                lesson.domain.project(lesson.texture + STEP_FRACTION * direction)
             )
 
 
-def slopes(
-    chosen: Sequence[TextureLesson],
+def compute_texture_gradients(
+    selected: Sequence[TextureLesson],
     model: Callable[[Tensor], Tensor],
     change: Callable[[Tensor], Tensor] = lambda images: images,
 ) -> Sequence[Tensor]:
     """Return the gradient (d,) of each lesson's loss with respect to its texture.
 
     Args:
-        chosen: the lessons.
+        selected: the lessons.
         model: returns logits (N, C).
         change: is applied to the images (N, H, W, 3) before.
     """
-    textures = [lesson.texture.clone().requires_grad_() for lesson in chosen]
+    textures = [lesson.texture.clone().requires_grad_() for lesson in selected]
     images = torch.stack(
-        [lesson.picture(u) for lesson, u in zip(chosen, textures, strict=True)]
+        [lesson.compute_image(u) for lesson, u in zip(selected, textures, strict=True)]
     )
-    right = [lesson.right for lesson in chosen]
-    loss = surprise(model(change(images)), right).sum()
+    right = [lesson.right_classes for lesson in selected]
+    loss = negative_log_likelihood(model(change(images)), right).sum()
     return torch.autograd.grad(loss, textures)
 
 
-def save_pictures(
-    run: RunDirectory, number: int, chosen: Sequence[Lesson], labels: Sequence[str]
+def save_lesson_images(
+    run: RunDirectory, number: int, selected: Sequence[Lesson], labels: Sequence[str]
 ) -> None:
     """Write the images of a round's lessons, and those of all rounds as a WebDataset.
 
-    The images are ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png`` in `PICTURES`
+    The images are ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png`` in `IMAGE_DIRECTORY`
     of the run. The WebDataset is next to that directory. It has a ``.png`` of each
     image, a ``.cls`` with the index of its class, and a ``.json`` with that and the
     kind of image. Members have no time and no owner, so that equal images make equal
     files.
     """
-    for index, lesson in enumerate(chosen):
-        label = re.sub(r"[^a-z0-9]+", "-", labels[lesson.right[0]].lower()).strip("-")
-        class_directory = f"{PICTURES}/{lesson.right[0]:04d}-{label}"
+    for index, lesson in enumerate(selected):
+        label = re.sub(
+            r"[^a-z0-9]+", "-", labels[lesson.right_classes[0]].lower()
+        ).strip("-")
+        class_directory = f"{IMAGE_DIRECTORY}/{lesson.right_classes[0]:04d}-{label}"
         (run.path / class_directory).mkdir(parents=True, exist_ok=True)
         name = f"{number:03d}-{index:05d}"
-        run.save_image(f"{name}-plain", lesson.plain, class_directory)
-        if with_worst([lesson]):
-            run.save_image(f"{name}-worst", lesson.worst, class_directory)
-    _write_webdataset(run.path / PICTURES)
+        run.save_image(f"{name}-plain", lesson.plain_image, class_directory)
+        if select_hard_lessons([lesson]):
+            run.save_image(f"{name}-worst", lesson.worst_image, class_directory)
+    _write_webdataset(run.path / IMAGE_DIRECTORY)
 
 
 def _write_webdataset(directory: Path) -> None:
-    """Write the images of a directory into a tar beside it; see `save_pictures`."""
+    """Write the images of a directory into a tar beside it; see `save_lesson_images`."""
     with (
         writing.replacing(directory.with_suffix(".tar")) as temporary_path,
         tarfile.open(temporary_path, "w") as tar,

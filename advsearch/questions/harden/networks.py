@@ -20,12 +20,12 @@ class Trainable:
     """A copy of a network whose trained parameters collect gradients.
 
     Attributes:
-        net: the network.
+        network: the network.
         model: predicts with the same weights, in evaluation mode and without gradients
             for them.
     """
 
-    net: nn.Module
+    network: nn.Module
     model: Model
 
     def logits(self, images: Tensor) -> Tensor:
@@ -34,32 +34,34 @@ class Trainable:
         Args:
             images: (N, H, W, 3) sRGB in [0, 1].
         """
-        trained_model = replace(self.model, module=self.net, attached=False)
+        trained_model = replace(self.model, module=self.network, attached=False)
         with self._mixed_precision():
             x = self.model.preprocessing(images.to(self.model.device)).to(
                 self.model.dtype
             )
-            logits: Tensor = trained_model.ask(x)
+            logits: Tensor = trained_model.run_network(x)
         return logits
 
-    def quickly(self, images: Tensor) -> Tensor:
+    def evaluation_logits(self, images: Tensor) -> Tensor:
         """Return the logits of `model` for images (N, H, W, 3) in mixed precision."""
         with self._mixed_precision():
             logits: Tensor = self.model(images)
         return logits
 
-    def twin(self) -> Trainable:
+    def make_twin(self) -> Trainable:
         """Return the same weights with gradients of their own, for another thread."""
-        net: nn.Module = self.model.with_network(self.net).module  # type: ignore[assignment]
+        net: nn.Module = self.model.with_network(self.network).module  # type: ignore[assignment]
         for parameter, original in zip(
-            net.parameters(), self.net.parameters(), strict=True
+            net.parameters(), self.network.parameters(), strict=True
         ):
             parameter.requires_grad_(original.requires_grad)
         return Trainable(net, self.model.with_network(net))
 
     def parameters(self) -> list[nn.Parameter]:
         """Return the parameters that are trained."""
-        return [weights for weights in self.net.parameters() if weights.requires_grad]
+        return [
+            weights for weights in self.network.parameters() if weights.requires_grad
+        ]
 
     def _mixed_precision(self) -> torch.autocast:
         """Return a context that uses bfloat16 if the processor has instructions for it.
@@ -75,7 +77,9 @@ class Trainable:
         return torch.autocast("cpu", torch.bfloat16, enabled=bfloat16)
 
 
-def trainable(model: Model, layers: str = "all", *, logits: bool = True) -> Trainable:
+def make_trainable(
+    model: Model, layers: str = "all", *, logits: bool = True
+) -> Trainable:
     """Copy a model's network to train it further.
 
     It stays in evaluation mode: statistics of batches stay what they were learned as,
@@ -111,7 +115,7 @@ def trainable(model: Model, layers: str = "all", *, logits: bool = True) -> Trai
 
 
 @contextmanager
-def one_thread_each() -> Iterator[ThreadPoolExecutor]:
+def open_single_threaded_pool() -> Iterator[ThreadPoolExecutor]:
     """Open as many threads as torch has, each of which uses a single one of torch's.
 
     So they do not wait for each other at barriers.

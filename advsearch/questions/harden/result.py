@@ -22,7 +22,7 @@ from advsearch.extend import (
 
 STEPS = 40
 """Of a search, as of an attack."""
-ALL = "all"
+ALL_OBJECTS = "all"
 """Value of `object` that stands for all bundled objects."""
 PLAIN_SCENES = 6
 """Further scenes for each one of the training, with one plain view each.
@@ -33,7 +33,7 @@ accuracy.
 RENDERED_SCENES = 15
 """The same where controls are rendered: the view is rendered at random configurations."""
 
-TEXTURE_LOOKS = 6
+TEXTURE_USES_PER_EPOCH = 6
 """How often an epoch uses a scene with a texture, over its views.
 
 The texture is another one each time, while what was rendered stays.
@@ -55,7 +55,7 @@ class HardenConfig(AttackConfig):
 
     # fmt: off
     command: ClassVar[str] = "harden"
-    several: ClassVar[tuple[str, ...]] = ("object", "environment")
+    list_settings: ClassVar[tuple[str, ...]] = ("object", "environment")
     without: ClassVar[tuple[str, ...]] = (
         "smallest", "ensemble", "printable", "aov", "metrics", "log", "target",
         "minimise", "over", "draws", "path", "shutter", "rolling", "average",
@@ -64,7 +64,7 @@ class HardenConfig(AttackConfig):
     )
 
     object: str = setting_as_in(
-        AttackConfig, "object", default=ALL,
+        AttackConfig, "object", default=ALL_OBJECTS,
         description="objects to train on, separated by commas; all: every bundled one "
                     "that the model has a class for; "
         "a file is called as its class: coffee-mug.glb",
@@ -108,7 +108,7 @@ class HardenConfig(AttackConfig):
         3, "training",
         "how often a round looks at each view; where a texture is searched, as many "
         "times as often as makes "
-        f"{TEXTURE_LOOKS} for a scene, at most, over its views",
+        f"{TEXTURE_USES_PER_EPOCH} for a scene, at most, over its views",
         ge=1, le=10_000,
     )
     rate: float = setting(1e-3, "training", "the highest learning rate", gt=0.0, le=1.0)
@@ -135,12 +135,12 @@ class HardenConfig(AttackConfig):
         return {**QUICK, **data} if data.get("quick") is True else data
 
     @property
-    def texture_looks(self) -> int:
+    def texture_uses_per_epoch(self) -> int:
         """How often an epoch uses each view of a scene with a texture."""
-        return max(1, TEXTURE_LOOKS // self.views)
+        return max(1, TEXTURE_USES_PER_EPOCH // self.views)
 
     @property
-    def title(self) -> tuple[str, ...]:
+    def title_words(self) -> tuple[str, ...]:
         return self.command, *self.controls
 
 
@@ -304,7 +304,7 @@ ShareChanges = Mapping[str, tuple[Share | None, Share | None]]
 """Fractions before and after, by what they are of."""
 
 
-def shown(result: HardenResult) -> ShownResult:
+def make_harden_view(result: HardenResult) -> ShownResult:
     """Return the view of a hardening."""
     shares = _share_changes(result)
     chart: dict[str, Any] = {}
@@ -425,7 +425,7 @@ def _summarize(result: HardenResult) -> str:
     return text
 
 
-def claims(result: HardenResult) -> Iterator[views.Claim]:
+def make_harden_claims(result: HardenResult) -> Iterator[views.Claim]:
     """Yield the shares of held-out scenes without a failure."""
     for when, share in (("Before", result.before), ("After hardening", result.after)):
         if share is not None:

@@ -27,22 +27,22 @@ from torch import Tensor, nn
 from advsearch.extend import RunDirectory, seeds, wording, workbench
 from advsearch.questions.harden.networks import Trainable
 from advsearch.questions.harden.result import TrainingRound
-from advsearch.questions.harden.scenes import TRAINING, VALIDATION, SceneWork
+from advsearch.questions.harden.scenes import TRAINING, VALIDATION, SceneJobs
 
-WEIGHTS = "artifacts/hardened.safetensors"
+WEIGHTS_FILE = "artifacts/hardened.safetensors"
 """File of the best weights in the run."""
-ROUND = "artifacts/round-{:03d}.safetensors"
+ROUND_FILE = "artifacts/round-{:03d}.safetensors"
 """File of the weights after each round."""
-ROUNDS = "rounds"
+ROUNDS_NOTE = "rounds"
 """Note of a run: the result of each round."""
-LARGEST_GRADIENT_NORM = 2.0
-JUDGED = 168
+MAX_GRADIENT_NORM = 2.0
+MAX_VALIDATION_SCENES = 168
 """Limit of the number of validation scenes."""
-PARTS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
+INTERPOLATIONS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
 """Interpolations that are evaluated: 0 is the original weights, 1 the trained ones."""
 
-MakeOptimiser = Callable[[Sequence[nn.Parameter]], torch.optim.Optimizer]
-Take = Callable[[Sequence[Any], np.random.Generator], None]
+MakeOptimizer = Callable[[Sequence[nn.Parameter]], torch.optim.Optimizer]
+ComputeGradient = Callable[[Sequence[Any], np.random.Generator], None]
 """Computes the gradient of a batch of items, and leaves it with the parameters."""
 
 
@@ -53,7 +53,7 @@ class Score(NamedTuple):
     robust: float
 
 
-class Course(ABC):
+class Trainer(ABC):
     """Trains models of one task on items, each of which has images of a scene.
 
     Attributes:
@@ -62,25 +62,25 @@ class Course(ABC):
         optimiser: creates the optimizer of the parameters, with a learning rate of its
             own; None for AdamW.
         custom_items: items that are trained on along with the sampled ones.
-        further: scenes that are sampled in addition to each one of the training.
-        views: number of views of a training scene, and of a validation scene.
-        batch: items of a step.
-        warm_up: fraction of the steps in which the learning rate rises.
-        average: decay per step of the running average of the weights, which a round
+        n_further_scenes: scenes that are sampled in addition to each one of the training.
+        n_views: number of views of a training scene, and of a validation scene.
+        batch_size: items of a step.
+        warm_up_fraction: fraction of the steps in which the learning rate rises.
+        average_decay: decay per step of the running average of the weights, which a round
             ends with.
     """
 
-    batch: ClassVar[int]
+    batch_size: ClassVar[int]
     weight_decay: ClassVar[float]
-    warm_up: ClassVar[float]
-    average: ClassVar[float] = 0.0
-    views: tuple[int, int]
+    warm_up_fraction: ClassVar[float]
+    average_decay: ClassVar[float] = 0.0
+    n_views: tuple[int, int]
 
     def __init__(
         self,
-        work: SceneWork,
+        work: SceneJobs,
         student: Trainable,
-        optimiser: MakeOptimiser | None = None,
+        optimiser: MakeOptimizer | None = None,
         custom_items: Sequence[Any] = (),
     ) -> None:
         self.work = work
@@ -90,26 +90,28 @@ class Course(ABC):
         self.custom_items = custom_items
 
     @property
-    def further(self) -> int:
+    def n_further_scenes(self) -> int:
         """Scenes that are sampled in addition to each one of the training."""
         return 0
 
     @abstractmethod
-    def draw(self, title: str, split: str, places: range) -> list[Any]:
+    def sample_items(self, title: str, split: str, scene_numbers: range) -> list[Any]:
         """Sample the items of scenes.
 
         Args:
             title: of the stage that the progress reports.
             split: that the scenes belong to.
-            places: numbers of the scenes.
+            scene_numbers: numbers of the scenes.
         """
 
     @abstractmethod
-    def looks(self, item: Any) -> int:
+    def uses_per_epoch(self, item: Any) -> int:
         """Return how often an epoch uses an item."""
 
     @abstractmethod
-    def gradients(self, new: Sequence[Any]) -> AbstractContextManager[Take]:
+    def gradient_context(
+        self, new: Sequence[Any]
+    ) -> AbstractContextManager[ComputeGradient]:
         """Return a context in which gradients are computed.
 
         Args:
@@ -121,13 +123,13 @@ class Course(ABC):
         """Evaluate the student on items of the validation, which are not changed."""
 
     @abstractmethod
-    def save(self, run: RunDirectory, number: int, new: Sequence[Any]) -> None:
+    def save_images(self, run: RunDirectory, number: int, new: Sequence[Any]) -> None:
         """Write the images of a round's new items into `PICTURES` of the run."""
 
-    def steps(self, pool: Sequence[Any]) -> int:
+    def count_steps(self, pool: Sequence[Any]) -> int:
         """Return the number of optimizer steps of a round."""
-        n_items = sum(self.looks(item) for item in pool)
-        return self.config.epochs * math.ceil(n_items / self.batch)
+        n_items = sum(self.uses_per_epoch(item) for item in pool)
+        return self.config.epochs * math.ceil(n_items / self.batch_size)
 
     def round(
         self,
@@ -145,24 +147,28 @@ class Course(ABC):
             tick: is called after each step.
         """
         parameters = self.student.parameters()
-        optimizer, schedule = self._make_optimizer(parameters, self.steps(pool))
+        optimizer, schedule = self._make_optimizer(parameters, self.count_steps(pool))
         average = [parameter.detach().clone() for parameter in parameters]
         n_steps = 0
         rng = np.random.default_rng([seeds.stream(self.config.seed, "order"), number])
         indices = [
-            index for index, item in enumerate(pool) for _ in range(self.looks(item))
+            index
+            for index, item in enumerate(pool)
+            for _ in range(self.uses_per_epoch(item))
         ]
-        with self.gradients(new) as compute_gradient:
+        with self.gradient_context(new) as compute_gradient:
             for _ in range(self.config.epochs):
                 order = rng.permutation(indices)
-                for start in range(0, len(order), self.batch):
-                    batch = [pool[index] for index in order[start : start + self.batch]]
+                for start in range(0, len(order), self.batch_size):
+                    batch = [
+                        pool[index] for index in order[start : start + self.batch_size]
+                    ]
                     compute_gradient(batch, rng)
-                    nn.utils.clip_grad_norm_(parameters, LARGEST_GRADIENT_NORM)
+                    nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
                     optimizer.step()
                     schedule.step()
                     n_steps += 1
-                    decay = min(self.average, n_steps / (n_steps + 5))
+                    decay = min(self.average_decay, n_steps / (n_steps + 5))
                     for mean, parameter in zip(average, parameters, strict=True):
                         mean.lerp_(parameter.detach(), 1.0 - decay)
                     tick()
@@ -184,13 +190,13 @@ class Course(ABC):
             optimizer,
             [float(group["lr"]) for group in optimizer.param_groups],
             total_steps=n_rates,
-            pct_start=warm_up_fraction(self.warm_up, n_rates),
+            pct_start=adjust_warm_up(self.warm_up_fraction, n_rates),
             cycle_momentum=False,
         )
         return optimizer, schedule
 
 
-def warm_up_fraction(fraction: float, n_rates: int) -> float:
+def adjust_warm_up(fraction: float, n_rates: int) -> float:
     """Return the fraction of the steps in which the learning rate rises.
 
     It is a little larger where that is a single step, since OneCycleLR divides by the
@@ -203,85 +209,91 @@ class Rounds:
     """The rounds of a run.
 
     Attributes:
-        done: the result of each round that has ended; the first is the original model.
+        results: the result of each round that has ended; the first is the original model.
     """
 
-    def __init__(self, run: RunDirectory, course: Course) -> None:
+    def __init__(self, run: RunDirectory, trainer: Trainer) -> None:
         self.run = run
-        self.course = course
-        self.config = course.config
-        self.progress = course.work.progress
-        self.done = [
+        self.trainer = trainer
+        self.config = trainer.config
+        self.progress = trainer.work.progress
+        self.results = [
             TrainingRound.of(fields)
-            for fields in json.loads(run.store.note(ROUNDS) or "[]")
+            for fields in json.loads(run.store.note(ROUNDS_NOTE) or "[]")
         ]
 
     @property
-    def judged(self) -> int:
+    def n_validation_scenes(self) -> int:
         """Number of validation scenes for each control.
 
-        A third as many as a round adds, up to `JUDGED`.
+        A third as many as a round adds, up to `MAX_VALIDATION_SCENES`.
         """
-        return min(math.ceil(self.config.scenes / 3), JUDGED)
+        return min(math.ceil(self.config.scenes / 3), MAX_VALIDATION_SCENES)
 
     @property
     def best(self) -> int:
         """The most robust round whose clean accuracy has fallen by no more than allowed."""
         allowed = [
             number
-            for number, training_round in enumerate(self.done)
-            if self._allowed(training_round.clean)
+            for number, training_round in enumerate(self.results)
+            if self.is_allowed(training_round.clean)
         ]
         return max(
-            allowed, key=lambda number: (self.done[number].robust, number), default=0
+            allowed, key=lambda number: (self.results[number].robust, number), default=0
         )
 
-    def _allowed(self, clean: float) -> bool:
+    def is_allowed(self, clean: float) -> bool:
         """Return whether a clean accuracy has fallen by no more than allowed."""
-        return clean >= self.done[0].clean - self.config.clean_loss - 1e-9
+        return clean >= self.results[0].clean - self.config.clean_loss - 1e-9
 
-    def carry_out(self) -> None:
+    def execute(self) -> None:
         """Run the rounds that are left, and write the best weights.
 
         Afterwards the student has the best weights.
         """
-        course = self.course
+        course = self.trainer
         config = self.config
-        network = course.student.net
-        if len(self.done) <= config.rounds:
+        network = course.student.network
+        if len(self.results) <= config.rounds:
             pool = list(course.custom_items)
             n_trained = 0
             title = "drawing scenes to choose weights by"
-            held_back = course.draw(title, VALIDATION, range(self.judged))
-            if not self.done:
+            held_back = course.sample_items(
+                title, VALIDATION, range(self.n_validation_scenes)
+            )
+            if not self.results:
                 self.progress.stage("judging the model as it is")
-                self.keep(0, [], course.score(held_back), 0, 0.0)
+                self.store_round(0, [], course.score(held_back), 0, 0.0)
             for number in range(1, config.rounds + 1):
-                network.load_state_dict(self._weights(number - 1))
+                network.load_state_dict(self.read_weights(number - 1))
                 scene_numbers = range(
                     (number - 1) * config.scenes, number * config.scenes
                 )
                 title = f"round {number}: drawing scenes"
-                new_items = course.draw(title, TRAINING, scene_numbers)
+                new_items = course.sample_items(title, TRAINING, scene_numbers)
                 pool += new_items
-                if number < len(self.done):
+                if number < len(self.results):
                     continue  # it ended before this run was stopped
-                self.progress.stage(f"round {number}: training", course.steps(pool))
+                self.progress.stage(
+                    f"round {number}: training", course.count_steps(pool)
+                )
                 with workbench.all_for_torch():
                     # Earlier items are as hard as their training left them.
                     course.round(
                         number, pool, pool[n_trained:], lambda: self.progress.advance(1)
                     )
                     self.progress.stage(
-                        f"round {number}: choosing weights", len(PARTS), at_most=True
+                        f"round {number}: choosing weights",
+                        len(INTERPOLATIONS),
+                        at_most=True,
                     )
-                    score, part = self.mixed(held_back)
+                    score, part = self.select_interpolation(held_back)
                 n_trained = len(pool)
-                self.keep(number, new_items, score, len(pool), part)
-        network.load_state_dict(self._weights(self.best))
-        self._save(WEIGHTS)
+                self.store_round(number, new_items, score, len(pool), part)
+        network.load_state_dict(self.read_weights(self.best))
+        self.write_weights(WEIGHTS_FILE)
 
-    def mixed(self, held_back: Sequence[Any]) -> tuple[Score, float]:
+    def select_interpolation(self, held_back: Sequence[Any]) -> tuple[Score, float]:
         """Set the student to the best interpolation between original and trained weights.
 
         The best one is right most often on the worst images among those whose clean
@@ -291,10 +303,10 @@ class Rounds:
         search of its own.
 
         Returns:
-            Its score, and the interpolation: a member of `PARTS`.
+            Its score, and the interpolation: a member of `INTERPOLATIONS`.
         """
-        network = self.course.student.net
-        original = self._weights(0)
+        network = self.trainer.student.network
+        original = self.read_weights(0)
         trained = {
             name: weight.clone() for name, weight in network.state_dict().items()
         }
@@ -309,12 +321,12 @@ class Rounds:
 
         scores = dict[float, Score]()
         allowed = dict[float, float]()
-        for part in PARTS:
+        for part in INTERPOLATIONS:
             interpolate(part)
-            score = self.course.score(held_back)
+            score = self.trainer.score(held_back)
             scores[part] = score
             self.progress.advance(1, worst=score.robust)
-            if self._allowed(score.clean):
+            if self.is_allowed(score.clean):
                 allowed[part] = score.robust
             if allowed and list(allowed.values())[-1] < max(allowed.values()):
                 break
@@ -325,33 +337,38 @@ class Rounds:
         interpolate(best_part)
         return scores[best_part], best_part
 
-    def keep(
-        self, number: int, new: Sequence[Any], judged: Score, trained: int, part: float
+    def store_round(
+        self,
+        number: int,
+        new_items: Sequence[Any],
+        score: Score,
+        n_trained: int,
+        part: float,
     ) -> None:
         """Store the weights of a round, its new images and its result.
 
         Args:
             number: of the round.
-            new: its new items.
-            judged: the score of the weights.
-            trained: number of items that it was trained on.
+            new_items: its new items.
+            score: the score of the weights.
+            n_trained: number of items that it was trained on.
             part: the interpolation of the weights; see `mixed`.
         """
-        self._save(ROUND.format(number))
-        self.course.save(self.run, number, new)
-        self.done.append(
-            TrainingRound(lessons=trained, part=part, **judged._asdict(), kept=False)
+        self.write_weights(ROUND_FILE.format(number))
+        self.trainer.save_images(self.run, number, new_items)
+        self.results.append(
+            TrainingRound(lessons=n_trained, part=part, **score._asdict(), kept=False)
         )
-        fields = [training_round.model_dump() for training_round in self.done]
-        self.run.store.set_note(ROUNDS, json.dumps(fields))
-        clean, worst = map(wording.percent, judged)
+        fields = [training_round.model_dump() for training_round in self.results]
+        self.run.store.set_note(ROUNDS_NOTE, json.dumps(fields))
+        clean, worst = map(wording.percent, score)
         self.progress.message(
             f"round {number}: {clean} of plain pictures right, {worst} of the worst"
         )
 
-    def _save(self, name: str) -> None:
+    def write_weights(self, name: str) -> None:
         """Write the student's weights into a file of the run."""
-        state = self.course.student.net.state_dict()
+        state = self.trainer.student.network.state_dict()
         # Two names may belong to one tensor, which safetensors rejects.
         cloned = {
             key: weight.clone(memory_format=torch.contiguous_format)
@@ -359,6 +376,8 @@ class Rounds:
         }
         self.run.write_file(name, safetensors.save(cloned))
 
-    def _weights(self, number: int) -> dict[str, Tensor]:
+    def read_weights(self, number: int) -> dict[str, Tensor]:
         """Read the weights of a round."""
-        return safetensors.load((self.run.path / ROUND.format(number)).read_bytes())
+        return safetensors.load(
+            (self.run.path / ROUND_FILE.format(number)).read_bytes()
+        )

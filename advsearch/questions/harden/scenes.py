@@ -29,10 +29,13 @@ from advsearch.extend import (
     settings,
     workbench,
 )
-from advsearch.questions.harden.changed_light import varied, white_light_changed
-from advsearch.questions.harden.lessons import Lesson, lessons
+from advsearch.questions.harden.changed_light import (
+    change_white_light,
+    vary_environment,
+)
+from advsearch.questions.harden.lessons import Lesson, make_lessons
 from advsearch.questions.harden.objects import OBJECTS
-from advsearch.questions.harden.result import ALL, HardenConfig
+from advsearch.questions.harden.result import ALL_OBJECTS, HardenConfig
 
 TRAINING = "training"
 """Split that the weights are fitted to."""
@@ -46,13 +49,13 @@ HELD_OUT = "held out"
 ROBUST = "robust"
 """Status of a scene in which no attack found a wrong prediction."""
 
-OVER: dict[str, dict[str, object]] = {
+RANDOM_RANGES: dict[str, dict[str, object]] = {
     "camera": {"azimuth": [0.0, 360.0], "elevation": [8.0, 55.0], "roll": [-6.0, 6.0]},
     "environment": {"rotation": [0.0, 360.0], "exposure": [-0.8, 0.5]},
 }
 """Ranges that vary at random from view to view, unless they are searched."""
 
-TRIES_TO_CHOOSE = 6
+N_VALIDATION_TRIES = 6
 """Random configurations of a validation view that is rendered; the worst one counts."""
 CLEAN_SCENES = 4
 """Held-out scenes whose plain images are evaluated, for each one that is attacked."""
@@ -61,20 +64,20 @@ CLEAN_VIEWS = 2
 CLEAN_SPP = 16
 """Samples per pixel of these views."""
 
-STRONGER = {
+STRONGER_POLICY = {
     "name": "portfolio",
     "policies": [{"name": "restarts", "policy": "pgd"}, "cmaes", "random"],
 }
 """The policy of the stronger search."""
-TIMES = 3
+STRONGER_STEPS_FACTOR = 3
 """Steps of the stronger search as a multiple of the usual steps."""
 
-Wanted = partial[Any]
-"""A job: a method of `SceneWork` with its arguments, among which is a `number`."""
+Job = partial[Any]
+"""A job: a method of `SceneJobs` with its arguments, among which is a `number`."""
 
 
 @dataclass
-class SceneWork:
+class SceneJobs:
     """Runs jobs on single scenes with the original model, here or on workers.
 
     The jobs are pure functions.
@@ -89,34 +92,36 @@ class SceneWork:
 
     config: HardenConfig
     model: Model
-    splits: Mapping[str, SceneSide]
+    splits: Mapping[str, SceneSplit]
     progress: Progress = field(default_factory=workbench.NullProgress)
     executor: Any = None
 
-    def __call__(self, wanted: Iterable[Wanted]) -> list[Any]:
-        return [job(self) for job in wanted]
+    def __call__(self, jobs: Iterable[Job]) -> list[Any]:
+        return [job(self) for job in jobs]
 
-    def each(
-        self, title: str, wanted: Sequence[Wanted], hint: str = ""
+    def run_jobs(
+        self, title: str, jobs: Sequence[Job], hint: str = ""
     ) -> Iterator[tuple[int, Any]]:
         """Run jobs, and yield the index and the result of each in any order.
 
         Args:
             title: of the stage that the progress reports.
-            wanted: the jobs.
+            jobs: the jobs.
             hint: how to shorten the stage.
         """
-        self.progress.stage(title, len(wanted), hint=hint)
-        index_of_job = {id(job): index for index, job in enumerate(wanted)}
+        self.progress.stage(title, len(jobs), hint=hint)
+        index_of_job = {id(job): index for index, job in enumerate(jobs)}
         executor = self.executor or workbench.InProcess(self)
-        for batch in executor.results([job] for job in wanted):
+        for batch in executor.compute([job] for job in jobs):
             (job,) = batch.items
             (value,) = batch.require_value(f"harden, scene {job.keywords['number']}")
-            progress_facts = {} if executor.facts is None else executor.facts.told
+            progress_facts = (
+                {} if executor.stats is None else executor.stats.progress_counts
+            )
             self.progress.advance(1, **progress_facts)
             yield index_of_job[id(job)], value
 
-    def drawn(
+    def sample_lessons(
         self,
         *,
         split: str,
@@ -138,13 +143,15 @@ class SceneWork:
             shared: whether the views share one adversarial texture.
             varying_controls: further controls that vary at random.
         """
-        problem, seed = self.problem(
+        problem, seed = self.make_problem(
             self.splits[split], number, controls, varying_controls
         )
-        tries = TRIES_TO_CHOOSE if split == VALIDATION else None
-        return lessons(problem, views, seed, plain=plain, tries=tries, shared=shared)
+        tries = N_VALIDATION_TRIES if split == VALIDATION else None
+        return make_lessons(
+            problem, views, seed, n_plain=plain, n_tries=tries, shares_texture=shared
+        )
 
-    def attacked(
+    def attack_held_out(
         self, *, control: str, number: int, times: int, weights: bytes | None = None
     ) -> str:
         """Attack a held-out scene, and return the status of the attack.
@@ -158,18 +165,20 @@ class SceneWork:
             times: multiple of the usual steps; more than one is the stronger search.
             weights: of the model, safetensors; None for the original ones.
         """
-        name, scene = self.splits[HELD_OUT].scene(
-            number, workbench.scene_settings(self.config)
+        name, scene = self.splits[HELD_OUT].load_scene(
+            number, workbench.collect_scene_parameters(self.config)
         )
         seed = seeds.stream(self.config.seed, f"measured {control}", number)
         search: dict[str, Any] = {}
         if times > 1:
-            search = {"policy": STRONGER, "steps": times * self.config.steps}
-        config = self.attack((control,), name, seed=seed, **search)
+            search = {"policy": STRONGER_POLICY, "steps": times * self.config.steps}
+        config = self.make_attack_config((control,), name, seed=seed, **search)
         model = self.model if weights is None else self.with_weights(weights)
         return attack_scene(config, scene, model)
 
-    def looked_at(self, *, number: int, weights: bytes) -> dict[str, list[Any]]:
+    def evaluate_plain_images(
+        self, *, number: int, weights: bytes
+    ) -> dict[str, list[Any]]:
         """Evaluate the model on plain images of a held-out scene.
 
         Returns:
@@ -179,11 +188,13 @@ class SceneWork:
         """
         split = self.splits[HELD_OUT]
         results_by_name = dict[str, list[Any]]()
-        problem, _ = self.problem(split, number, tuple(self.config.controls)[:1])
+        problem, _ = self.make_problem(split, number, tuple(self.config.controls)[:1])
         for view in range(CLEAN_VIEWS):
             seed = seeds.stream(split.seed, "plain", number * CLEAN_VIEWS + view)
             image = problem.picture(problem.domain.start, seed, CLEAN_SPP)[None]
-            truth = problem.truth(problem.whole(problem.domain.start, seed))
+            truth = problem.find_truth(
+                problem.add_conditions(problem.domain.start, seed)
+            )
             models = {"before": self.model, "after": self.with_weights(weights)}
             for when, model in models.items():
                 with torch.no_grad():
@@ -201,26 +212,28 @@ class SceneWork:
         return self.model.with_network(network)
 
     @cached_property
-    def linear(self) -> tuple[str, ...]:
+    def linear_controls(self) -> tuple[str, ...]:
         """The controls whose images a matrix of light transport gives."""
         return tuple(
             control for control in self.config.controls if self._has_matrix(control)
         )
 
     @property
-    def rendered(self) -> tuple[str, ...]:
+    def rendered_controls(self) -> tuple[str, ...]:
         """The controls whose images have to be rendered."""
         return tuple(
-            control for control in self.config.controls if control not in self.linear
+            control
+            for control in self.config.controls
+            if control not in self.linear_controls
         )
 
     @cached_property
-    def beside(self) -> tuple[str, ...]:
+    def random_controls(self) -> tuple[str, ...]:
         """The rendered controls that can vary at random while a matrix is used."""
         return tuple(
             name
-            for name in self.rendered
-            if all(self._has_matrix(other, name) for other in self.linear)
+            for name in self.rendered_controls
+            if all(self._has_matrix(other, name) for other in self.linear_controls)
         )
 
     def _has_matrix(self, *controls: str) -> bool:
@@ -229,7 +242,7 @@ class SceneWork:
         The others vary at random.
         """
         try:
-            problem, _ = self.problem(
+            problem, _ = self.make_problem(
                 self.splits[TRAINING], 0, controls[:1], controls[1:]
             )
             return problem.is_linear
@@ -242,12 +255,12 @@ class SceneWork:
     def _held_out_fingerprints(self) -> frozenset[str]:
         """The fingerprints of the objects that are measured."""
         n_scenes = CLEAN_SCENES * self.config.measured
-        held_out_objects = self.splits[HELD_OUT].assets(n_scenes)
-        return frozenset(fingerprint(asset) for asset in held_out_objects)
+        held_out_objects = self.splits[HELD_OUT].generate_objects(n_scenes)
+        return frozenset(compute_fingerprint(asset) for asset in held_out_objects)
 
-    def problem(
+    def make_problem(
         self,
-        split: SceneSide,
+        split: SceneSplit,
         number: int,
         controls: Sequence[str],
         varying_controls: Sequence[str] = (),
@@ -260,24 +273,28 @@ class SceneWork:
             controls: that are searched.
             varying_controls: that vary at random.
         """
-        name, scene = split.scene(number, workbench.scene_settings(self.config))
+        name, scene = split.load_scene(
+            number, workbench.collect_scene_parameters(self.config)
+        )
         if split.name != HELD_OUT:
-            check_unmeasured(scene.description.object, self._held_out_fingerprints)
+            check_not_held_out(scene.description.object, self._held_out_fingerprints)
         control_types = {
             control.partition(":")[0].partition(".")[0]
             for control in (*controls, *varying_controls)
         }
         over = {
             control_type: ranges
-            for control_type, ranges in OVER.items()
+            for control_type, ranges in RANDOM_RANGES.items()
             if control_type not in control_types
         }
         over |= {control: self.config.controls[control] for control in varying_controls}
-        config = self.attack(controls, name, over=over)
-        problem = workbench.problem_of(config, scene, self.model, differentiated=False)
+        config = self.make_attack_config(controls, name, over=over)
+        problem = workbench.make_problem_on(
+            config, scene, self.model, differentiated=False
+        )
         return problem, seeds.stream(split.seed, "views", number)
 
-    def attack(
+    def make_attack_config(
         self, controls: Sequence[str], name: str, **changes: object
     ) -> AttackConfig:
         """Return the settings of an attack.
@@ -291,14 +308,16 @@ class SceneWork:
         # A setting that none of the controls takes is None.
         changed: dict[str, Any] = {}
         for control, ranges in searched.items():
-            control_settings = workbench.settings_alone(self.config, control, ranges)
+            control_settings = workbench.select_run_settings(
+                self.config, control, ranges
+            )
             set_values = {
                 setting: value
                 for setting, value in control_settings.items()
                 if value is not None
             }
             unset = dict.fromkeys(control_settings)
-            changed = settings.merged({**unset, **changed}, set_values)
+            changed = settings.merge_mappings({**unset, **changed}, set_values)
         changed |= {
             "object": name,
             "environment": None,
@@ -307,7 +326,7 @@ class SceneWork:
             **changes,
             "controls": searched,
         }
-        return AttackConfig.of(
+        return AttackConfig.from_config(
             self.config,
             **changed,
             measure="no",
@@ -317,20 +336,20 @@ class SceneWork:
         )
 
 
-def load_scene_work(described: Mapping[str, Any]) -> SceneWork:
+def load_scene_work(config_fields: Mapping[str, Any]) -> SceneJobs:
     """Load what a worker needs to run jobs on scenes, by the fields of the settings."""
-    config = HardenConfig(**described)
+    config = HardenConfig(**config_fields)
     (model, *_), _ = workbench.load_models(
         [config.model], workbench.make_task(config.task), config
     )
     # Garbage is collected after each scene. A sixth of the time would go into visiting
     # the objects that exist by now.
     gc.freeze()
-    return SceneWork(config, model, splits_of(config, model))
+    return SceneJobs(config, model, make_splits(config, model))
 
 
 def attack_scene(config: AttackConfig, scene: workbench.Scene, model: Model) -> str:
-    """Attack a scene, and return the status; see `SceneWork.attacked`."""
+    """Attack a scene, and return the status; see `SceneJobs.attacked`."""
     summary = workbench.attack_on(config, scene, model).summary
     if summary.ending == results.INTERRUPTED:
         raise KeyboardInterrupt
@@ -339,26 +358,26 @@ def attack_scene(config: AttackConfig, scene: workbench.Scene, model: Model) -> 
     control = summary.clean.control
     if control is None:
         return "unsteady"
-    n_needed = workbench.WORST_CASE.needed(control.trials)
+    n_needed = workbench.WORST_CASE.count_needed(control.trials)
     return ROBUST if control.correct >= n_needed else "unsteady"
 
 
 # ---- the split
 # ----------------------------------------------------------------------------------
 
-RANGES = {
+SCENE_RANGES = {
     "camera.azimuth": (0.0, 360.0),
     "camera.elevation": (8.0, 55.0),
     "camera.fov": (25.0, 45.0),
     "environment.rotation": (0.0, 360.0),
 }
 """Ranges from which scenes sample parameters, in degrees."""
-GROUND = (0.1, 0.9)
+GROUND_BRIGHTNESS_RANGE = (0.1, 0.9)
 """Range of the ground's brightness, sRGB, around which the channels differ."""
 
 
 @dataclass(frozen=True)
-class SceneSide:
+class SceneSplit:
     """One part of the split, which has scenes by number.
 
     Attributes:
@@ -375,8 +394,8 @@ class SceneSide:
     seed: int
     varied: bool = False
 
-    def scene(
-        self, number: int, given: Mapping[str, Any] | None = None
+    def load_scene(
+        self, number: int, fixed_settings: Mapping[str, Any] | None = None
     ) -> tuple[str, workbench.Scene]:
         """Return a scene, and the name of its object.
 
@@ -385,17 +404,19 @@ class SceneSide:
 
         Args:
             number: of the scene, from 0.
-            given: parameters with fixed values.
+            fixed_settings: parameters with fixed values.
         """
         name = self.objects[number % len(self.objects)]
-        rng = self._draws(number)
+        rng = self.make_generator(number)
         asset = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
         environment = self.environments[int(rng.integers(len(self.environments)))]
-        scene_settings = {**_sample_scene_settings(rng), **(given or {})}
+        scene_settings = {**_sample_scene_settings(rng), **(fixed_settings or {})}
         scene = workbench.load_scene(asset, environment, settings=scene_settings)
         description = scene.description
         if self.varied and description.environment is not None:
-            light = white_light_changed(varied(description.environment, rng), rng)
+            light = change_white_light(
+                vary_environment(description.environment, rng), rng
+            )
             description = replace(description, environment=light)
         if description.object.label is None:
             label = Path(name).stem.replace("-", " ").replace("_", " ")
@@ -405,41 +426,43 @@ class SceneSide:
             scene = workbench.Scene(description)
         return name, scene
 
-    def _draws(self, number: int) -> np.random.Generator:
+    def make_generator(self, number: int) -> np.random.Generator:
         """Return the random generator of a scene."""
         return np.random.default_rng(
             [seeds.stream(self.seed, f"{self.name} scene", number)]
         )
 
-    def assets(self, count: int) -> Iterator[assets.ObjectAsset]:
+    def generate_objects(self, count: int) -> Iterator[assets.ObjectAsset]:
         """Yield the objects of the first `count` scenes, those in files only once."""
         for number in range(count):
             name = self.objects[number % len(self.objects)]
             if name in OBJECTS:
-                yield OBJECTS[name].generate(self._draws(number))
+                yield OBJECTS[name].generate(self.make_generator(number))
             elif number == self.objects.index(name):
-                yield self.scene(number)[1].description.object
+                yield self.load_scene(number)[1].description.object
 
 
 def _sample_scene_settings(rng: np.random.Generator) -> dict[str, float]:
-    """Sample the color of the ground, and the parameters in `RANGES`."""
-    ground = np.clip(rng.uniform(*GROUND) + rng.normal(0.0, 0.05, 3), 0.02, 0.98)
+    """Sample the color of the ground, and the parameters in `SCENE_RANGES`."""
+    ground = np.clip(
+        rng.uniform(*GROUND_BRIGHTNESS_RANGE) + rng.normal(0.0, 0.05, 3), 0.02, 0.98
+    )
     scene_settings = {
-        parameter: rng.uniform(*bounds) for parameter, bounds in RANGES.items()
+        parameter: rng.uniform(*bounds) for parameter, bounds in SCENE_RANGES.items()
     }
     for channel, value in zip(("red", "green", "blue"), ground.tolist(), strict=True):
         scene_settings[f"ground.{channel}"] = value
     return scene_settings
 
 
-def splits_of(config: HardenConfig, model: Model) -> dict[str, SceneSide]:
+def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
     """Return the parts of the split by name.
 
     Raises:
         InputError: the model has a class for no object, or an object in a file has no
             held-out instance.
     """
-    objects = tuple(OBJECTS) if config.object == ALL else config.objects
+    objects = tuple(OBJECTS) if config.object == ALL_OBJECTS else config.objects
     known = tuple(
         name
         for name in objects
@@ -458,7 +481,7 @@ def splits_of(config: HardenConfig, model: Model) -> dict[str, SceneSide]:
         )
     training_environments = _environments(config.environment, "train")
     splits = {
-        name: SceneSide(
+        name: SceneSplit(
             name,
             known,
             training_environments,
@@ -470,7 +493,7 @@ def splits_of(config: HardenConfig, model: Model) -> dict[str, SceneSide]:
     held_out_objects = known
     if config.held_out is not None:
         held_out_objects = settings.split_names(config.held_out)
-    splits[HELD_OUT] = SceneSide(
+    splits[HELD_OUT] = SceneSplit(
         HELD_OUT,
         held_out_objects,
         _environments(config.held_out_environment, "heldout"),
@@ -493,50 +516,56 @@ def _environments(names: str | None, bundled_split: str) -> tuple[str, ...]:
     return workbench.library.list_environments(bundled_split)
 
 
-def fingerprint(asset: assets.ObjectAsset) -> str:
+def compute_fingerprint(asset: assets.ObjectAsset) -> str:
     """Return a hash of an object's mesh and texture."""
     arrays = (asset.mesh.vertices, asset.mesh.faces, asset.base_color)
     data = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
     return hashlib.sha256(data).hexdigest()
 
 
-def check_disjoint(held: SceneSide, taught: Sequence[SceneSide]) -> None:
+def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) -> None:
     """Check that nothing is measured that is trained on.
 
     Of each bundled object only the first instance is compared here; all others, which
     take minutes, when they are sampled.
 
     Args:
-        held: the held-out part of the split.
-        taught: the other parts.
+        held_out: the held-out part of the split.
+        training_splits: the other parts.
 
     Raises:
         InputError: an environment or a file is in both.
     """
-    training_environments = {name for split in taught for name in split.environments}
-    common = sorted(training_environments & set(held.environments))
+    training_environments = {
+        name for split in training_splits for name in split.environments
+    }
+    common = sorted(training_environments & set(held_out.environments))
     if common:
         raise InputError(
             f"held_out_environment: {', '.join(common)} is an environment "
             "of the training too; name others"
         )
-    measured = set(map(fingerprint, held.assets(len(held.objects))))
-    for split in taught:
-        for asset in split.assets(len(split.objects)):
-            check_unmeasured(asset, measured)
+    measured = set(
+        map(compute_fingerprint, held_out.generate_objects(len(held_out.objects)))
+    )
+    for split in training_splits:
+        for asset in split.generate_objects(len(split.objects)):
+            check_not_held_out(asset, measured)
 
 
-def check_unmeasured(asset: assets.ObjectAsset, measured: Set[str]) -> None:
+def check_not_held_out(
+    asset: assets.ObjectAsset, held_out_fingerprints: Set[str]
+) -> None:
     """Check that an object of the training is not measured.
 
     Args:
         asset: the object.
-        measured: fingerprints of what is measured.
+        held_out_fingerprints: fingerprints of what is measured.
 
     Raises:
         InputError: it is.
     """
-    if fingerprint(asset) in measured:
+    if compute_fingerprint(asset) in held_out_fingerprints:
         raise InputError(
             f"held_out: {asset.name} is an object of the training too; name others"
         )

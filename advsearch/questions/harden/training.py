@@ -21,33 +21,42 @@ from advsearch.questions.harden.lessons import (
     Lesson,
     RenderedLesson,
     TextureLesson,
-    surprise,
-    with_worst,
+    negative_log_likelihood,
+    select_hard_lessons,
 )
-from advsearch.questions.harden.networks import Augmentation, Trainable, one_thread_each
+from advsearch.questions.harden.networks import (
+    Augmentation,
+    Trainable,
+    open_single_threaded_pool,
+)
 from advsearch.questions.harden.result import PLAIN_SCENES, RENDERED_SCENES
-from advsearch.questions.harden.rounds import Course, MakeOptimiser, Score, Take
-from advsearch.questions.harden.scenes import FURTHER, TRAINING, SceneWork, Wanted
+from advsearch.questions.harden.rounds import (
+    ComputeGradient,
+    MakeOptimizer,
+    Score,
+    Trainer,
+)
+from advsearch.questions.harden.scenes import FURTHER, TRAINING, Job, SceneJobs
 
-PART = 6
+LESSONS_PER_PART = 6
 """Lessons of a step that one thread works at."""
-FIRST_STEPS = 4
+N_FIRST_STEPS = 4
 """Steps of the search of each texture before a training."""
-HELD_BACK_STEPS = 8
+N_VALIDATION_STEPS = 8
 """Steps of the search of the textures by which weights are chosen, from its start."""
 AUGMENTATION = Augmentation(
     smallest_crop=0.75, largest_crop=1.15, turn=15.0, cutout=0.0
 )
 """Of training images; the search for worse ones sees the same."""
-KEEP = 1.0
+ORIGINAL_MODEL_WEIGHT = 1.0
 """Weight of the original model's predictions of plain images, relative to the loss."""
-MIXED = 0.5
+MIXUP_PROBABILITY = 0.5
 """Fraction of the parts of a batch that mix their images."""
-MIXING = 0.4
+MIXUP_BETA = 0.4
 """Both parameters of the beta distribution of the mixing weights."""
-SHARED = 0.25
+SHARED_TEXTURE_PROBABILITY = 0.25
 """Fraction of the scenes with a texture in which all views have the same texture."""
-MOVED = 0.5
+RANDOM_CONTROLS_PROBABILITY = 0.5
 """Fraction of the scenes with a texture in which rendered controls vary too."""
 
 Examples = Iterable[tuple[Tensor, Tensor]]
@@ -56,7 +65,7 @@ Examples = Iterable[tuple[Tensor, Tensor]]
 """
 
 
-class ClassifierCourse(Course):
+class ClassifierTrainer(Trainer):
     """Train a classifier on lessons.
 
     It keeps the original model's predictions of plain images.
@@ -69,28 +78,30 @@ class ClassifierCourse(Course):
             repeated from the start when they end.
     """
 
-    batch = 24
+    batch_size = 24
     weight_decay = 0.02
-    warm_up = 0.1
-    average = 0.98
+    warm_up_fraction = 0.1
+    average_decay = 0.98
 
     def __init__(
         self,
-        work: SceneWork,
+        work: SceneJobs,
         student: Trainable,
-        optimiser: MakeOptimiser | None = None,
+        optimiser: MakeOptimizer | None = None,
         beside: Examples | None = None,
     ) -> None:
         super().__init__(work, student, optimiser)
-        self.views = (self.config.views, 2)
+        self.n_views = (self.config.views, 2)
         self.beside = beside
         self._example_batches: Iterator[tuple[Tensor, Tensor]] = iter(())
 
     @property
-    def further(self) -> int:
-        return RENDERED_SCENES if self.work.rendered else PLAIN_SCENES
+    def n_further_scenes(self) -> int:
+        return RENDERED_SCENES if self.work.rendered_controls else PLAIN_SCENES
 
-    def draw(self, title: str, split: str, places: range) -> list[Lesson]:
+    def sample_items(
+        self, title: str, split: str, scene_numbers: range
+    ) -> list[Lesson]:
         """Make lessons of the scenes of a split with these numbers.
 
         There are lessons for each control with a matrix of light transport, and for all
@@ -100,38 +111,38 @@ class ClassifierCourse(Course):
         rendered scene of the training has a plain lesson too, where the original
         model's predictions count.
         """
-        jobs = self._matrix_jobs(split, places)
-        rendered = self.work.rendered
+        jobs = self._matrix_jobs(split, scene_numbers)
+        rendered = self.work.rendered_controls
         if rendered:
             n_views = 1
             n_plain = 1
             if split != TRAINING:
-                n_views = self.views[1]
+                n_views = self.n_views[1]
                 n_plain = 0
             jobs += [
                 _lesson_job(split, number, rendered, n_views, n_plain)
-                for number in places
+                for number in scene_numbers
             ]
         if split == TRAINING:
-            jobs += self._further_jobs(places)
-        lessons_of_job = dict(self.work.each(title, jobs))
+            jobs += self._further_jobs(scene_numbers)
+        lessons_of_job = dict(self.work.run_jobs(title, jobs))
         sampled_lessons: list[Lesson] = []
         for index in range(len(jobs)):
             sampled_lessons += lessons_of_job[index]
         return sampled_lessons
 
-    def _matrix_jobs(self, split: str, scene_numbers: range) -> list[Wanted]:
+    def _matrix_jobs(self, split: str, scene_numbers: range) -> list[Job]:
         """Return the jobs of the controls that have a matrix of light transport."""
         is_training = split == TRAINING
-        n_views = self.views[0] if is_training else self.views[1]
-        jobs = list[Wanted]()
-        for control in self.work.linear:
+        n_views = self.n_views[0] if is_training else self.n_views[1]
+        jobs = list[Job]()
+        for control in self.work.linear_controls:
             for number in scene_numbers:
                 shares_texture = False
                 varies = False
                 if is_training:
-                    shares_texture, varies = self.chance(control, number)
-                varying_controls = self.work.beside if varies else ()
+                    shares_texture, varies = self.sample_scene_options(control, number)
+                varying_controls = self.work.random_controls if varies else ()
                 jobs.append(
                     _lesson_job(
                         split,
@@ -145,15 +156,15 @@ class ClassifierCourse(Course):
                 )
         return jobs
 
-    def _further_jobs(self, scene_numbers: range) -> list[Wanted]:
+    def _further_jobs(self, scene_numbers: range) -> list[Job]:
         """Return the jobs of the further scenes of the training, of one view each."""
-        first = self.further * scene_numbers[0]
-        end = self.further * (scene_numbers[-1] + 1)
-        controls = self.work.linear[:1]
+        first = self.n_further_scenes * scene_numbers[0]
+        end = self.n_further_scenes * (scene_numbers[-1] + 1)
+        controls = self.work.linear_controls[:1]
         n_views = 0
         n_plain = 1
-        if self.work.rendered:
-            controls = self.work.rendered
+        if self.work.rendered_controls:
+            controls = self.work.rendered_controls
             n_views = 1
             n_plain = 0
         return [
@@ -161,28 +172,32 @@ class ClassifierCourse(Course):
             for number in range(first, end)
         ]
 
-    def chance(self, control: str, number: int) -> tuple[bool, bool]:
+    def sample_scene_options(self, control: str, number: int) -> tuple[bool, bool]:
         """Return whether the views of a scene share a texture, and others vary too.
 
         It is random, since objects take turns.
         """
         seed = seeds.stream(self.config.seed, f"views of {control}", number)
         shared, moved = np.random.default_rng(seed).random(2)
-        return bool(shared < SHARED), bool(moved < MOVED)
+        return bool(shared < SHARED_TEXTURE_PROBABILITY), bool(
+            moved < RANDOM_CONTROLS_PROBABILITY
+        )
 
-    def looks(self, item: Lesson) -> int:
-        return self.config.texture_looks if isinstance(item, TextureLesson) else 1
+    def uses_per_epoch(self, item: Lesson) -> int:
+        return (
+            self.config.texture_uses_per_epoch if isinstance(item, TextureLesson) else 1
+        )
 
     @contextmanager
-    def gradients(self, new: Sequence[Lesson]) -> Iterator[Take]:
-        lessons.harder(new, self.student.model, FIRST_STEPS)
-        with one_thread_each() as pool:
-            gradients = Gradients(self.student, self.work.model, pool)
-            yield lambda batch, rng: gradients.take(
-                batch, self._next(), int(rng.integers(2**62))
+    def gradient_context(self, new: Sequence[Lesson]) -> Iterator[ComputeGradient]:
+        lessons.search_worse_images(new, self.student.model, N_FIRST_STEPS)
+        with open_single_threaded_pool() as pool:
+            gradients = GradientComputer(self.student, self.work.model, pool)
+            yield lambda batch, rng: gradients.compute(
+                batch, self.next_examples(), int(rng.integers(2**62))
             )
 
-    def _next(self) -> tuple[Tensor, Tensor] | None:
+    def next_examples(self) -> tuple[Tensor, Tensor] | None:
         """Return the next batch of further examples; None if there are none."""
         if self.beside is None:
             return None
@@ -203,14 +218,16 @@ class ClassifierCourse(Course):
         for lesson in searched:
             if isinstance(lesson, TextureLesson):
                 lesson.texture = lesson.texture.clone()
-        lessons.harder(searched, model, HELD_BACK_STEPS)
-        hard_lessons = with_worst(searched)
-        clean = _accuracy(model, searched, lambda lesson: lesson.plain)
-        robust = _accuracy(model, hard_lessons, lambda lesson: lesson.worst)
+        lessons.search_worse_images(searched, model, N_VALIDATION_STEPS)
+        hard_lessons = select_hard_lessons(searched)
+        clean = _accuracy(model, searched, lambda lesson: lesson.plain_image)
+        robust = _accuracy(model, hard_lessons, lambda lesson: lesson.worst_image)
         return Score(clean, robust)
 
-    def save(self, run: RunDirectory, number: int, new: Sequence[Lesson]) -> None:
-        lessons.save_pictures(run, number, new, self.student.model.labels)
+    def save_images(
+        self, run: RunDirectory, number: int, new: Sequence[Lesson]
+    ) -> None:
+        lessons.save_lesson_images(run, number, new, self.student.model.labels)
 
 
 def _lesson_job(
@@ -220,10 +237,10 @@ def _lesson_job(
     views: int,
     plain: int,
     **options: Any,
-) -> Wanted:
-    """Return the job that makes lessons of a scene; see `SceneWork.drawn`."""
+) -> Job:
+    """Return the job that makes lessons of a scene; see `SceneJobs.drawn`."""
     return partial(
-        SceneWork.drawn,
+        SceneJobs.sample_lessons,
         split=split,
         number=number,
         controls=controls,
@@ -239,18 +256,18 @@ def _accuracy(
     """Return the fraction of lessons whose images (H, W, 3) a model gets right."""
     n_right = 0
     with torch.no_grad():
-        for start in range(0, len(chosen), lessons.TOGETHER):
-            batch = chosen[start : start + lessons.TOGETHER]
+        for start in range(0, len(chosen), lessons.BATCH_SIZE):
+            batch = chosen[start : start + lessons.BATCH_SIZE]
             logits = model(torch.stack([image_of(lesson) for lesson in batch]))
             predicted = logits.argmax(dim=1).tolist()
             n_right += sum(
-                index in lesson.right
+                index in lesson.right_classes
                 for index, lesson in zip(predicted, batch, strict=True)
             )
     return n_right / len(chosen)
 
 
-class Gradients:
+class GradientComputer:
     """Compute gradients of a network on several threads.
 
     Each of the threads uses one of torch's threads, so that they do not wait for each
@@ -262,14 +279,19 @@ class Gradients:
         pool: the threads.
     """
 
-    def __init__(self, student: Trainable, given: Model, pool: Executor) -> None:
+    def __init__(
+        self, student: Trainable, original_model: Model, pool: Executor
+    ) -> None:
         self._student = student
-        self._original_model = given
+        self._original_model = original_model
         self._pool = pool
         self._twins: list[Trainable] = []
 
-    def take(
-        self, batch: Sequence[Lesson], beside: tuple[Tensor, Tensor] | None, seed: int
+    def compute(
+        self,
+        batch: Sequence[Lesson],
+        further_batch: tuple[Tensor, Tensor] | None,
+        seed: int,
     ) -> None:
         """Make the worst images of lessons worse, and compute the gradient of the loss.
 
@@ -277,19 +299,19 @@ class Gradients:
 
         Args:
             batch: the lessons.
-            beside: further images (N, H, W, 3) and class indices (N,).
+            further_batch: further images (N, H, W, 3) and class indices (N,).
             seed: of the augmentation.
         """
         # Textures come first, so that both passes have the same parts.
         batch = sorted(batch, key=lambda lesson: not isinstance(lesson, TextureLesson))
         plain_weight = 1.0 / len(batch)
-        worst_weight = 1.0 / max(1, len(with_worst(batch)))
+        worst_weight = 1.0 / max(1, len(select_hard_lessons(batch)))
 
         def texture_gradients(
             part: Sequence[TextureLesson], twin: Trainable, seed: int
         ) -> Sequence[Tensor]:
-            return lessons.slopes(
-                part, twin.quickly, lambda images: _augment(images, seed)
+            return lessons.compute_texture_gradients(
+                part, twin.evaluation_logits, lambda images: _augment(images, seed)
             )
 
         def weight_gradients(
@@ -304,12 +326,14 @@ class Gradients:
             parts = self._map_parts(texture_gradients, texture_lessons, seed)
             return list(itertools.chain.from_iterable(parts))
 
-        lessons.ascend(batch, all_texture_gradients)
+        lessons.ascend_textures(batch, all_texture_gradients)
         gradients = self._map_parts(weight_gradients, batch, seed)
-        if beside is not None:
-            images, labels = beside
+        if further_batch is not None:
+            images, labels = further_batch
             logits = self._student.logits(images)
-            loss = surprise(logits, [(int(label),) for label in labels]).mean()
+            loss = negative_log_likelihood(
+                logits, [(int(label),) for label in labels]
+            ).mean()
             gradients.append(
                 torch.autograd.grad(loss, self._student.parameters(), allow_unused=True)
             )
@@ -329,9 +353,12 @@ class Gradients:
 
         It is called with the part, a copy of the network, and a seed.
         """
-        parts = [chosen[start : start + PART] for start in range(0, len(chosen), PART)]
+        parts = [
+            chosen[start : start + LESSONS_PER_PART]
+            for start in range(0, len(chosen), LESSONS_PER_PART)
+        ]
         n_missing = len(parts) - len(self._twins)
-        self._twins += [self._student.twin() for _ in range(n_missing)]
+        self._twins += [self._student.make_twin() for _ in range(n_missing)]
         return list(self._pool.map(function, parts, self._twins, itertools.count(seed)))
 
     def _loss(
@@ -357,29 +384,29 @@ class Gradients:
             worst_weight: of each worst image.
             seed: of the augmentation and the mixing.
         """
-        hard_lessons = with_worst(part)
+        hard_lessons = select_hard_lessons(part)
         taught: list[Lesson] = [*part, *hard_lessons]
-        right = [lesson.right for lesson in taught]
+        right = [lesson.right_classes for lesson in taught]
         images = _augmented_images(part, hard_lessons, seed)
 
         rng = np.random.default_rng(seed)
         mixed = list[int]()
-        if rng.random() < MIXED:
+        if rng.random() < MIXUP_PROBABILITY:
             mixed = [
                 index
                 for index, lesson in enumerate(taught)
                 if isinstance(lesson, RenderedLesson)
             ]
         partners = rng.permutation(mixed).astype(int).tolist()
-        sampled_weight = float(rng.beta(MIXING, MIXING))
+        sampled_weight = float(rng.beta(MIXUP_BETA, MIXUP_BETA))
         partner_weight = min(sampled_weight, 1.0 - sampled_weight)
         if mixed:
             images[mixed] = torch.lerp(images[mixed], images[partners], partner_weight)
 
         logits = student.logits(images)
-        losses = surprise(logits, right)
+        losses = negative_log_likelihood(logits, right)
         if mixed:
-            partner_losses = surprise(
+            partner_losses = negative_log_likelihood(
                 logits[mixed], [right[index] for index in partners]
             )
             losses[mixed] = torch.lerp(losses[mixed], partner_losses, partner_weight)
@@ -398,7 +425,7 @@ class Gradients:
                 logits[unrendered],
                 [right[index] for index in unrendered],
             )
-            loss = loss + plain_weight * KEEP * divergence
+            loss = loss + plain_weight * ORIGINAL_MODEL_WEIGHT * divergence
         return loss
 
     def _divergence_from_original(
@@ -431,10 +458,14 @@ def _augmented_images(
     worst textures are changed as in the search for them.
     """
     groups = [
-        [lesson.plain for lesson in part],
-        [lesson.worst for lesson in hard_lessons if isinstance(lesson, TextureLesson)],
+        [lesson.plain_image for lesson in part],
         [
-            lesson.worst
+            lesson.worst_image
+            for lesson in hard_lessons
+            if isinstance(lesson, TextureLesson)
+        ],
+        [
+            lesson.worst_image
             for lesson in hard_lessons
             if not isinstance(lesson, TextureLesson)
         ],

@@ -56,7 +56,7 @@ STORED_FIELDS = ("rendering", "right", "label", "file")
 """What a stored photograph says of its rendering, and its own file."""
 
 
-@workbench.helped
+@workbench.with_checked_arguments
 def photo_agreement(run: str | Path) -> PhotoAgreement:
     """Return how the photographs of a run agree with its renderings (docs/viewer.md).
 
@@ -96,7 +96,7 @@ def _read_photos(run: Path) -> pd.DataFrame:
     photograph; and "agrees", whether it is right where the rendering is.
     """
     rows = list[dict[str, object]]()
-    with workbench.in_turn(), Store.open_to_read(run) as store:
+    with workbench.hold_process_lock(), Store.open_to_read(run) as store:
         for row in store.rows(PHOTO):
             photo = _stored_photo(row)
             if not photo.keys() >= set(STORED_FIELDS):
@@ -245,7 +245,7 @@ class Photographs:
                 continue
             aligned = ALIGNED_NAME.fullmatch(file.stem)
             rendering = aligned[1] if aligned else None
-            data = stored_files.read_bytes(file, "a photograph", markup.LARGEST_SENT)
+            data = stored_files.read_bytes(file, "a photograph", markup.MAX_BODY_BYTES)
             try:
                 self._thread.submit(self._add, run, rendering, data, file.name).result()
             except InputError as error:
@@ -268,10 +268,10 @@ class Photographs:
         file = None
         cut_photo = b""
         if rendering is not None:
-            file = result.rendering_file(run, rendering)
+            file = result.find_rendering(run, rendering)
             with Image.open(file, formats=("PNG", "JPEG")) as image:
                 # A bad photograph is rejected before a scene is loaded.
-                cut_photo = result.sound_photo(data, image.size)
+                cut_photo = result.sanitize_photo(data, image.size)
         with RunDirectory.resume(run) as resumed_run:
             kind = PHOTO if rendering else LOOSE_PHOTO
             number = resumed_run.store.last_step(kind) + 1
@@ -280,7 +280,7 @@ class Photographs:
             for evaluator in self._load_evaluators(run):
                 values: Mapping[str, workbench.Value] = {}
                 if file is None or rendering is None:
-                    cut_photo = result.sound_photo(data, evaluator.size[::-1])
+                    cut_photo = result.sanitize_photo(data, evaluator.size[::-1])
                 else:
                     right, label, values = evaluator.evaluate_rendering(
                         resumed_run.store, rendering, file
@@ -295,7 +295,7 @@ class Photographs:
                     "value": evaluator.model.name,
                     "unit": "",
                 }
-                row = workbench.judged(
+                row = workbench.add_judgement(
                     workbench.Row(
                         kind, number, values={**values, "model": model_value}
                     ),
@@ -347,7 +347,7 @@ class _PhotoEvaluator:
         with torch.no_grad():
             output = self.model(pixels)
             truth = self.find_truth(rendering, object_name)
-            return workbench.judgements(self.task, output, pixels[None], [truth])[0]
+            return workbench.judge_images(self.task, output, pixels[None], [truth])[0]
 
     def evaluate_rendering(
         self, store: Store, rendering: str, file: Path
@@ -392,7 +392,7 @@ def _load_evaluators(run: Path) -> list[_PhotoEvaluator]:
 
 def _load_sweep_evaluators(config: SweepConfig) -> list[_PhotoEvaluator]:
     """Load the models of a sweep, and find ground truth by the numbers of its images."""
-    scenes = workbench.scenes_of(config)
+    scenes = workbench.load_scenes_of_sweep(config)
     job = scenes.job
 
     def find_truth(
@@ -402,21 +402,21 @@ def _load_sweep_evaluators(config: SweepConfig) -> list[_PhotoEvaluator]:
         task = job.tasks[model_index]
         if rendering is None or not _needs_position(task):
             matching = [
-                candidate for candidate in job.places if candidate.object == object_name
+                candidate for candidate in job.scenes if candidate.object == object_name
             ]
-            swept_scene = matching[0] if matching else job.places[0]
-            return task.truth(job.facts(swept_scene, {}))
+            swept_scene = matching[0] if matching else job.scenes[0]
+            return task.truth(job.make_facts(swept_scene, {}))
         number = int(rendering)
-        if number >= job.per_scene * len(job.places):
+        if number >= job.images_per_scene * len(job.scenes):
             raise InputError(
                 f"rendering: the sweep has no picture {rendering}; it "
                 "belongs to another run"
             )
-        scene, queries = scenes.asked(number)
+        scene, queries = scenes.make_queries(number)
         query = queries[model_index]
-        return scene.problems[model_index].truth(query.u, query.values)
+        return scene.problems[model_index].find_truth(query.u, query.values)
 
-    models = zip(job.models, job.tasks, job.sizes, strict=True)
+    models = zip(job.models, job.tasks, job.image_sizes, strict=True)
     return [
         _PhotoEvaluator(
             model, task, size, partial(find_truth, index), index, len(job.models)
@@ -427,25 +427,25 @@ def _load_sweep_evaluators(config: SweepConfig) -> list[_PhotoEvaluator]:
 
 def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvaluator]:
     """Load the models of an attack, and find ground truth by the names of its images."""
-    problem, _ = workbench.problem_from_config(workbench.judged_alone(config))
+    problem, _ = workbench.problem_from_config(workbench.with_evaluation_only(config))
 
     def find_truth(task: Task, rendering: str | None, _: str | None) -> workbench.Truth:
         """Return the ground truth of the clean or adversarial scene, or of a trial."""
         u = problem.domain.start
         is_adversarial = rendering not in (None, "clean")
         if is_adversarial and _needs_position(task):
-            u = workbench.kept_configuration(run, problem)
+            u = workbench.read_stored_configuration(run, problem)
         trial = (rendering or "").rpartition("verification-")[2]
         seed = None
         if trial.isdigit():
             seed = seeds.stream(problem.seed, "verification", int(trial))
-        configuration = problem.whole(u, seed)
+        configuration = problem.add_conditions(u, seed)
         find_surfaces = partial(problem.renderer.surfaces, configuration)
         describe = partial(problem.space.describe, configuration)
-        return task.truth(problem.facts(describe, find_surfaces))
+        return task.truth(problem.make_facts(describe, find_surfaces))
 
     models: list[tuple[Model, Task]] = [(problem.model, problem.task)]
-    if isinstance(problem.task, workbench.Together):
+    if isinstance(problem.task, workbench.EnsembleTask):
         models = list(zip(problem.task.models, problem.task.tasks, strict=True))
     return [
         _PhotoEvaluator(

@@ -14,11 +14,11 @@ from typing import Any
 
 from advsearch.extend import InputError, markup
 from advsearch.questions.photographs.result import (
-    align_page,
-    photo_file,
-    rendering_file,
-    rendering_names,
-    table_html,
+    find_photo,
+    find_rendering,
+    list_renderings,
+    make_agreement_table,
+    make_align_page,
 )
 
 KEY = "X-Advsearch-Key"
@@ -48,9 +48,9 @@ class PhotographPages:
         return Photographs()
 
     def make_page(self, run: Path, name: str, key: str, elsewhere: str | None) -> str:
-        """Return the page of a run's photographs; arguments as for `align_page`."""
-        return align_page(
-            name, rendering_names(run), self._photographs.agreement(run), key, elsewhere
+        """Return the page of a run's photographs; arguments as for `make_align_page`."""
+        return make_align_page(
+            name, list_renderings(run), self._photographs.agreement(run), key, elsewhere
         )
 
     def read_picture(self, kind: str, run: Path, name: str) -> tuple[str, bytes]:
@@ -64,11 +64,11 @@ class PhotographPages:
         Raises:
             Refused: there is no such image.
         """
-        with refused(HTTPStatus.NOT_FOUND):
+        with reject_invalid(HTTPStatus.NOT_FOUND):
             if kind == "rendering":
-                file = rendering_file(run, name)
+                file = find_rendering(run, name)
             else:
-                file = photo_file(run, name)
+                file = find_photo(run, name)
         media_type = "image/png" if file.suffix == ".png" else "image/jpeg"
         return media_type, file.read_bytes()
 
@@ -101,16 +101,16 @@ class PhotographPages:
                 HTTPStatus.FORBIDDEN,
                 "a photograph is sent by the page that this server shows; open it anew",
             )
-        with refused(HTTPStatus.NOT_FOUND):
-            rendering_file(run, name)
-        with refused(HTTPStatus.BAD_REQUEST):
+        with reject_invalid(HTTPStatus.NOT_FOUND):
+            find_rendering(run, name)
+        with reject_invalid(HTTPStatus.BAD_REQUEST):
             table = self._photographs.add(run, name, read_data())
-        response = {"table": str(table_html(table))}
+        response = {"table": str(make_agreement_table(table))}
         return "application/json", json.dumps(response).encode()
 
 
 @contextmanager
-def refused(status: HTTPStatus) -> Iterator[None]:
+def reject_invalid(status: HTTPStatus) -> Iterator[None]:
     """Turn an InputError into a response with a status."""
     try:
         yield

@@ -77,17 +77,17 @@ class PhotoAgreement(results.Fields):
     renderings: list[PhotographedRendering]
 
 
-MOST_PIXELS = 50_000_000
+MAX_PIXELS = 50_000_000
 """Limit of a photograph as it is sent; the largest phones take 50 million."""
-SIDE = 1024
+MAX_SIZE = 1024
 """Longer side, in pixels, of a photograph that is stored."""
-QUALITY = 95
+JPEG_QUALITY = 95
 """Of its JPEG file, 1 to 95."""
 _NAME = re.compile(r"[0-9]{1,12}|clean|adversarial|verification-[0-9]{2}")
 _PHOTO = re.compile(rf"(?:{_NAME.pattern})-[0-9]{{4,9}}\.jpg")
 
 
-def rendering_file(run: Path, name: str) -> Path:
+def find_rendering(run: Path, name: str) -> Path:
     """Return the file of a rendering.
 
     Raises:
@@ -96,7 +96,7 @@ def rendering_file(run: Path, name: str) -> Path:
     file = None
     if _NAME.fullmatch(name):
         if name.isdigit():
-            file = markup.kept_file(run, int(name))
+            file = markup.find_thumbnail(run, int(name))
         else:
             file = run / directory.IMAGES / f"{name}.png"
     if file is None or not file.is_file():
@@ -107,9 +107,9 @@ def rendering_file(run: Path, name: str) -> Path:
     return file
 
 
-def rendering_names(run: Path) -> tuple[str, ...]:
+def list_renderings(run: Path) -> tuple[str, ...]:
     """Return the names of a run's renderings; empty if it stored none."""
-    stored_images = markup.kept_pictures(run)
+    stored_images = markup.find_thumbnails(run)
     if stored_images is not None:
         return tuple(map(str, stored_images.numbers))
     names = [
@@ -120,7 +120,7 @@ def rendering_names(run: Path) -> tuple[str, ...]:
     return tuple(sorted(names, key=lambda name: (name != "adversarial", name)))
 
 
-def photo_file(run: Path, name: str) -> Path:
+def find_photo(run: Path, name: str) -> Path:
     """Return the file of a stored photograph.
 
     Raises:
@@ -132,46 +132,46 @@ def photo_file(run: Path, name: str) -> Path:
     return file
 
 
-def sound_photo(data: bytes, shape: tuple[int, int]) -> bytes:
+def sanitize_photo(data: bytes, shape: tuple[int, int]) -> bytes:
     """Return the center of a photograph as a JPEG without metadata.
 
     Args:
         data: a file in JPEG, PNG or WebP.
         shape: (width, height) whose aspect ratio it is cut to. The longer side is at
-            most `SIDE` pixels.
+            most `MAX_SIZE` pixels.
 
     Raises:
         InputError: it is too large, or no such image.
     """
-    if len(data) > markup.LARGEST_SENT:
+    if len(data) > markup.MAX_BODY_BYTES:
         raise InputError(
-            f"photo: expected at most {markup.LARGEST_SENT >> 20} MB, got "
+            f"photo: expected at most {markup.MAX_BODY_BYTES >> 20} MB, got "
             "more; send a smaller one"
         )
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
-            if image.width * image.height > MOST_PIXELS:
+            if image.width * image.height > MAX_PIXELS:
                 raise InputError(
-                    f"photo: expected at most {MOST_PIXELS:,} pixels, got "
+                    f"photo: expected at most {MAX_PIXELS:,} pixels, got "
                     f"{image.width} x {image.height}"
                 )
             # A JPEG is decoded at about the size that is needed.
-            image.draft("RGB", (2 * SIDE, 2 * SIDE))
+            image.draft("RGB", (2 * MAX_SIZE, 2 * MAX_SIZE))
             upright = ImageOps.exif_transpose(image).convert("RGB")
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise InputError(
-            f"photo: expected at most {MOST_PIXELS:,} pixels, got far more"
+            f"photo: expected at most {MAX_PIXELS:,} pixels, got far more"
         ) from None
     except (OSError, SyntaxError, ValueError, EOFError, OverflowError, MemoryError):
         raise InputError(
             "photo: expected a picture in JPEG, PNG or WebP, got "
             "something else or a part"
         ) from None
-    scale = min(SIDE, max(upright.size)) / max(shape)
+    scale = min(MAX_SIZE, max(upright.size)) / max(shape)
     width, height = (max(1, round(length * scale)) for length in shape)
     cut_photo = ImageOps.fit(upright, (width, height), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
-    cut_photo.save(buffer, "JPEG", quality=QUALITY)
+    cut_photo.save(buffer, "JPEG", quality=JPEG_QUALITY)
     return buffer.getvalue()
 
 
@@ -179,12 +179,12 @@ def sound_photo(data: bytes, shape: tuple[int, int]) -> bytes:
 # ----------------------------------------------------------------------------------
 
 
-def align_page(
+def make_align_page(
     run: str,
     renderings: Sequence[str],
     table: PhotoAgreement,
     key: str,
-    elsewhere: str | None,
+    phone_address: str | None,
 ) -> str:
     """Return the page on which photographs of a run are taken, as HTML.
 
@@ -193,14 +193,14 @@ def align_page(
         renderings: names of its renderings, of which the page shows the first.
         table: of agreement, below.
         key: that the server expects with a photograph.
-        elsewhere: address by which another device opens the page; None if none can.
+        phone_address: address by which another device opens the page; None if none can.
     """
     main = markup.element(
         "main",
         _align_section(renderings),
         markup.element("h2", "Renderings and reality"),
-        markup.element("div", table_html(table), id="agreement"),
-        None if elsewhere is None else _phone_section(elsewhere),
+        markup.element("div", make_agreement_table(table), id="agreement"),
+        None if phone_address is None else _phone_section(phone_address),
     )
     header = markup.element(
         "header",
@@ -211,9 +211,9 @@ def align_page(
     scripts: tuple[str, ...] = ()
     if renderings:
         page_data = {"key": key, "names": list(renderings[:1])}
-        data = [markup.data_script(page_data, "photographing")]
+        data = [markup.make_data_script(page_data, "photographing")]
         scripts = ("make.js", "align.js")
-    return markup.document(
+    return markup.make_document(
         f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True
     )
 
@@ -253,7 +253,7 @@ def _align_section(renderings: Sequence[str]) -> markup.Html:
 
 def _phone_section(address: str) -> markup.Html:
     """Return an address and its QR code, by which a phone opens the page."""
-    code = markup.qr_code(address)
+    code = markup.make_qr_code(address)
     if code:
         title = "QR code of the address below"
         content = markup.Html(code.svg_inline(omitsize=True, light="#fff", title=title))
@@ -269,7 +269,7 @@ def _phone_section(address: str) -> markup.Html:
     )
 
 
-def table_html(table: PhotoAgreement) -> markup.Html:
+def make_agreement_table(table: PhotoAgreement) -> markup.Html:
     """Return the counts of right and wrong predictions, in all and by rendering."""
     if not table.photos or table.interval is None:
         return markup.element("p", "No photographs yet.", class_="soft")
@@ -285,7 +285,7 @@ def table_html(table: PhotoAgreement) -> markup.Html:
         f"{wording.interval_text(table.interval)}."
     )
     return markup.join_html(
-        markup.element("div", markup.study_table(heads, counts), class_="agreement"),
+        markup.element("div", markup.make_table(heads, counts), class_="agreement"),
         markup.element("p", text),
         markup.element(
             "div",
@@ -315,7 +315,7 @@ def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html
         links = [
             markup.join_html(
                 markup.element(
-                    "a", label or "nothing", href=f"photos/{markup.in_address(file)}"
+                    "a", label or "nothing", href=f"photos/{markup.quote_name(file)}"
                 ),
                 " ",
             )
@@ -337,7 +337,7 @@ def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html
             ]
         )
     addresses = [
-        f"renderings/{markup.in_address(rendering.rendering)}"
+        f"renderings/{markup.quote_name(rendering.rendering)}"
         for rendering in renderings
     ]
-    return markup.study_table(heads, rows, addresses)
+    return markup.make_table(heads, rows, addresses)

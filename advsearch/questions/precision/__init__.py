@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from advsearch.extend import RunContext, experiment
-from advsearch.questions.precision.result import PrecisionConfig, PrecisionResult, shown
+from advsearch.questions.precision.result import (
+    PrecisionConfig,
+    PrecisionResult,
+    make_view,
+)
 
 
 @experiment(
@@ -11,7 +15,7 @@ from advsearch.questions.precision.result import PrecisionConfig, PrecisionResul
     "precision --object mug --control texture --seconds 300 --error 0.1 --run diagrams",
     "precision --object bowl --control camera --quantities gradient --loss model --json",
     positional_args=("object", "model"),
-    view=shown,
+    view=make_view,
 )
 def precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     """Measure error against run time of a scene and its gradients

@@ -20,7 +20,7 @@ from torch import Tensor
 from advsearch.extend import gradients, seeds
 from advsearch.questions.precision.result import PrecisionReference
 from advsearch.questions.precision.rule import (
-    Array,
+    Float64Array,
     Numbers,
     ReferenceValue,
     SampleSetting,
@@ -28,13 +28,13 @@ from advsearch.questions.precision.rule import (
 )
 
 # calls of a setting that have to fit into the budget before it is started
-LEAST = 5
+MIN_CALLS = 5
 # first calls of a setting, which take longer
-COLD = 2
+COLD_CALLS = 2
 # fraction of the remaining time that one setting may need
-CLAIM = 0.25
+MAX_SETTING_FRACTION = 0.25
 # maximum number of independent parts of a reference
-MOST_PARTS = 64
+MAX_REFERENCE_PARTS = 64
 Part = TypeVar("Part")
 
 
@@ -48,13 +48,13 @@ class TimeBudget:
         self._end = clock() + seconds
 
     @property
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """The remaining seconds, at least 0."""
         return max(0.0, self._end - self.clock())
 
-    def share(self, part: float) -> TimeBudget:
+    def take_fraction(self, fraction: float) -> TimeBudget:
         """Return a budget of a fraction of the remaining seconds."""
-        return TimeBudget(part * self.left, self.clock)
+        return TimeBudget(fraction * self.seconds_left, self.clock)
 
 
 @dataclass
@@ -62,8 +62,8 @@ class MeasuredRounds:
     """Measurements by setting, the seconds of each call, and settings that did not fit."""
 
     results: dict[SampleSetting, list[Any]] = field(default_factory=dict)
-    walls: dict[SampleSetting, list[float]] = field(default_factory=dict)
-    left_out: list[SampleSetting] = field(default_factory=list)
+    wall_seconds: dict[SampleSetting, list[float]] = field(default_factory=dict)
+    skipped: list[SampleSetting] = field(default_factory=list)
 
     def estimate_call_seconds(self, setting: SampleSetting) -> float:
         """Estimate the seconds of a call other than the first ones.
@@ -71,11 +71,11 @@ class MeasuredRounds:
         The estimate is the setting's own; else in proportion to the most expensive
         setting of its line; else at the highest rate of any line; 0 without any.
         """
-        if setting in self.walls:
-            walls = self.walls[setting]
-            warm = walls[COLD:] or walls[-1:]
+        if setting in self.wall_seconds:
+            walls = self.wall_seconds[setting]
+            warm = walls[COLD_CALLS:] or walls[-1:]
             return statistics.median(warm[-3:])
-        by_cost = sorted(self.walls, key=lambda each: each.cost)
+        by_cost = sorted(self.wall_seconds, key=lambda each: each.cost)
         most_expensive = {known.line: known for known in by_cost}
         rates = {
             line: self.estimate_call_seconds(known) / known.cost
@@ -83,23 +83,25 @@ class MeasuredRounds:
         }
         return setting.cost * rates.get(setting.line, max(rates.values(), default=0.0))
 
-    def estimate_needed_seconds(self, setting: SampleSetting, left: float) -> float:
-        """Estimate the seconds for `LEAST` calls of a new setting and of earlier ones.
+    def estimate_needed_seconds(
+        self, setting: SampleSetting, seconds_left: float
+    ) -> float:
+        """Estimate the seconds for `MIN_CALLS` calls of a new setting and of earlier ones.
 
-        An earlier setting that needs more than a fraction `CLAIM` of the remaining time
+        An earlier setting that needs more than a fraction `MAX_SETTING_FRACTION` of the remaining time
         turned out too expensive, and waits until the end.
         """
         cold_seconds = list[float]()
         earlier_seconds = 0.0
-        for known, walls in self.walls.items():
+        for known, walls in self.wall_seconds.items():
             call_seconds = self.estimate_call_seconds(known)
-            if len(walls) > COLD:
-                cold_seconds.append(sum(walls[:COLD]) - COLD * call_seconds)
-            needed = max(0, LEAST - len(walls)) * call_seconds
-            if needed <= CLAIM * left:
+            if len(walls) > COLD_CALLS:
+                cold_seconds.append(sum(walls[:COLD_CALLS]) - COLD_CALLS * call_seconds)
+            needed = max(0, MIN_CALLS - len(walls)) * call_seconds
+            if needed <= MAX_SETTING_FRACTION * seconds_left:
                 earlier_seconds += needed
         first = max(0.0, statistics.median(cold_seconds)) if cold_seconds else 0.0
-        new_seconds = LEAST * self.estimate_call_seconds(setting)
+        new_seconds = MIN_CALLS * self.estimate_call_seconds(setting)
         return first + new_seconds + earlier_seconds
 
 
@@ -114,7 +116,7 @@ def measure_in_rounds(
 ) -> MeasuredRounds:
     """Measure settings in rounds, cheapest first, until the budget is used up.
 
-    In the first round a setting is started only if `LEAST` calls of it, and those that
+    In the first round a setting is started only if `MIN_CALLS` calls of it, and those that
     the settings before it still need for as many, fit into the remaining time; the
     first is always measured. The first call compiles and records kernels, so that every
     setting has two at once: without the second, nothing would be known of its time. A
@@ -130,27 +132,28 @@ def measure_in_rounds(
         measurements.append(
             measure(setting, seeds.stream(seed, stream, len(measurements)))
         )
-        measured.walls.setdefault(setting, []).append(budget.clock() - start)
+        measured.wall_seconds.setdefault(setting, []).append(budget.clock() - start)
         on_done(setting)
 
     for setting in sorted(settings, key=lambda each: each.cost):
         if (
             measured.results
-            and measured.estimate_needed_seconds(setting, budget.left) > budget.left
+            and measured.estimate_needed_seconds(setting, budget.seconds_left)
+            > budget.seconds_left
         ):
-            measured.left_out.append(setting)
+            measured.skipped.append(setting)
         else:
             call(setting)
             call(setting)
     for _ in range(1, rounds):
         for setting in measured.results:
-            if measured.estimate_call_seconds(setting) <= budget.left:
+            if measured.estimate_call_seconds(setting) <= budget.seconds_left:
                 call(setting)
     return measured
 
 
 def take_reference_parts(
-    part: Callable[[int], Part],
+    take_part: Callable[[int], Part],
     budget: TimeBudget,
     on_done: Callable[[], None],
     seed: int,
@@ -162,9 +165,11 @@ def take_reference_parts(
     """
     parts: list[Part] = []
     slowest = 0.0
-    while len(parts) < 2 or (len(parts) < MOST_PARTS and slowest < budget.left):
+    while len(parts) < 2 or (
+        len(parts) < MAX_REFERENCE_PARTS and slowest < budget.seconds_left
+    ):
         start = budget.clock()
-        parts.append(part(seeds.stream(seed, "reference", len(parts))))
+        parts.append(take_part(seeds.stream(seed, "reference", len(parts))))
         slowest = max(budget.clock() - start, 0.5 * slowest)
         on_done()
     return parts
@@ -213,13 +218,16 @@ def measure_time(take: Callable[[], Part]) -> tuple[Part, dict[str, float]]:
 REFERENCE_SAMPLER = "multijitter"
 """Sampler of references: unbiased as all, and twice as fast to an error as others."""
 OIDN = " + oidn"
-COUNTS = {"independent": (4, 8, 16, 32, 64, 128, 256), "orthogonal": (4, 25, 121, 289)}
+SAMPLE_COUNTS = {
+    "independent": (4, 8, 16, 32, 64, 128, 256),
+    "orthogonal": (4, 25, 121, 289),
+}
 """Sample counts by sampler, which accepts them exactly; others have (4, 16, 64, 256).
 
 All but the independent sampler compile a kernel for each count.
 """
-FIRST = ("independent", "multijitter", "independent" + OIDN)
-LATER = 6.0
+PREFERRED_LINES = ("independent", "multijitter", "independent" + OIDN)
+OTHER_LINES_COST = 6.0
 """Lines that are measured first if time is short, and the extra cost of others."""
 
 
@@ -247,19 +255,19 @@ class PictureBench:
                 self._lines.append(name + OIDN)
         self._references: dict[tuple[str, str], ReferenceValue] = {}
         scenes = {
-            name: renderer.scene.like(sampler=name)
+            name: renderer.scene.copy_with(sampler=name)
             for name in {*samplers, REFERENCE_SAMPLER}
         }
         self._renderers = {
-            line: renderer.like(
+            line: renderer.copy_with(
                 scenes[line.removesuffix(OIDN)], denoiser=get_denoiser(line)
             )
             for line in {*self._lines, REFERENCE_SAMPLER, REFERENCE_SAMPLER + OIDN}
         }
         self.settings = list[SampleSetting]()
         for line in self._lines:
-            cost_factor = 1.0 if line in FIRST else LATER
-            for count in COUNTS.get(line, (4, 16, 64, 256)):
+            cost_factor = 1.0 if line in PREFERRED_LINES else OTHER_LINES_COST
+            for count in SAMPLE_COUNTS.get(line, (4, 16, 64, 256)):
                 self.settings.append(
                     SampleSetting(
                         "picture",
@@ -270,17 +278,17 @@ class PictureBench:
                     )
                 )
 
-    def refer(
+    def compute_references(
         self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
     ) -> list[PrecisionReference]:
         """Render the references, one for each denoiser, within a budget."""
         families = list(dict.fromkeys(map(get_denoiser, self._lines)))
         rows = []
         for index, family in enumerate(families):
-            share = budget.share(1.0 / (len(families) - index))
+            share = budget.take_fraction(1.0 / (len(families) - index))
             name = REFERENCE_SAMPLER + OIDN * (family == "oidn")
             take = partial(self._radiance, name)
-            spp = choose_part_samples(partial(take, 0), share.left)
+            spp = choose_part_samples(partial(take, 0), share.seconds_left)
             radiances = take_reference_parts(
                 partial(take, spp=spp), share, on_done, seed
             )
@@ -300,12 +308,12 @@ class PictureBench:
             rows.append(_make_row("margin", name, margin, spp))
         return rows
 
-    def _display_mean(self, mean: Array) -> Tensor:
+    def _display_mean(self, mean: Float64Array) -> Tensor:
         """Return the picture of a mean radiance (n,)."""
         size = (*self._formation.resolution, 3)
         return self._picture(torch.from_numpy(mean).to(torch.float32).reshape(size))
 
-    def floor(self, setting: SampleSetting, quantity: str) -> float:
+    def reference_error(self, setting: SampleSetting, quantity: str) -> float:
         """Return the error of the reference of a quantity."""
         return self._references[quantity, setting.family].error
 
@@ -342,7 +350,7 @@ def get_denoiser(line: str) -> str:
 ADJOINT_COST = {"adjoint": 3.0, "material": 60.0}
 """Cost of adjoint gradients in renders, with the kernels that `material` compiles."""
 # maximum number of coordinates for a reference by differences
-BY_COORDINATE = 32
+MAX_DIFFERENCE_COORDINATES = 32
 
 
 @dataclass(frozen=True)
@@ -364,7 +372,7 @@ class GradientPart:
     def group_names(self) -> set[str]:
         return {group.name for group in self.groups}
 
-    def of(self, gradient: Tensor) -> Array:
+    def select(self, gradient: Tensor) -> Float64Array:
         """Return the part (n,) of a gradient (d,)."""
         return flatten(
             torch.cat([gradient[group.coordinates] for group in self.groups])
@@ -383,7 +391,9 @@ def list_gradient_parts(
     For a linear loss, differences of the loss equal those of the picture, and are left
     out.
     """
-    sets = gradients.planning.comparable_sets(group for group in groups if group.valid)
+    sets = gradients.planning.list_comparable_sets(
+        group for group in groups if group.valid
+    )
     controls = [members[0].control for members, _ in sets]
     parts = []
     for members, candidates in sets:
@@ -420,8 +430,10 @@ class GradientBench:
         self._loss = loss
         self._u = u
         self.part = part
-        self._exact = renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
-        self._by_differences = part.size <= BY_COORDINATE
+        self._exact = renderer.copy_with(
+            renderer.scene.copy_with(sampler=REFERENCE_SAMPLER)
+        )
+        self._by_differences = part.size <= MAX_DIFFERENCE_COORDINATES
         adjoints = [name for name in part.estimators if name in ADJOINT_COST]
         self._reference_estimator = (
             "differences" if self._by_differences else (*adjoints, *part.estimators)[0]
@@ -430,19 +442,19 @@ class GradientBench:
         self.settings = list[SampleSetting]()
         for name in part.estimators:
             cost = 1.0 + ADJOINT_COST.get(name, part.count_renders(name))
-            for count in COUNTS["independent"]:
+            for count in SAMPLE_COUNTS["independent"]:
                 self.settings.append(
                     SampleSetting("gradient", name, count, count * cost, part.name)
                 )
 
-    def refer(
+    def compute_references(
         self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
     ) -> list[PrecisionReference]:
         """Compute the reference within a budget."""
         if self._by_differences:
             take = partial(self._take_derivatives, self._list_probes())
             spp = choose_part_samples(
-                partial(take, 0), budget.left, parts=3, counts=(16, 64, 256)
+                partial(take, 0), budget.seconds_left, parts=3, counts=(16, 64, 256)
             )
             parts = take_reference_parts(partial(take, spp=spp), budget, on_done, seed)
             disagreements = [disagreement for _, disagreement in parts]
@@ -453,7 +465,7 @@ class GradientBench:
             take_gradient = partial(
                 self._take_gradient, self._exact, self._reference_estimator
             )
-            spp = choose_part_samples(partial(take_gradient, 0), budget.left)
+            spp = choose_part_samples(partial(take_gradient, 0), budget.seconds_left)
             take_part = partial(take_gradient, spp=spp)
             gradient_parts = take_reference_parts(take_part, budget, on_done, seed)
             self.reference = estimate_reference(gradient_parts)
@@ -485,7 +497,7 @@ class GradientBench:
 
     def _take_derivatives(
         self, probes: Sequence[gradients.Probe], noise: int, spp: int
-    ) -> Array:
+    ) -> Float64Array:
         """Return derivatives and step errors, (2, n), along each probe.
 
         A derivative is extrapolated to a step of zero; its step error is the difference
@@ -500,10 +512,10 @@ class GradientBench:
             (reference.value, reference.steps[0] - reference.steps[1])
             for reference in references
         ]
-        table: Array = np.array(pairs, dtype=np.float64).T
+        table: Float64Array = np.array(pairs, dtype=np.float64).T
         return table
 
-    def floor(self, setting: SampleSetting, quantity: str) -> float:
+    def reference_error(self, setting: SampleSetting, quantity: str) -> float:
         """Return the error of the reference."""
         return self.reference.error if self.reference else 0.0
 
@@ -521,7 +533,7 @@ class GradientBench:
         )
         return {"gradient": {**self.reference.compare(gradient), **times}}
 
-    def bias(self, seed: int) -> str | None:
+    def check_bias(self, seed: int) -> str | None:
         """Check the reference by an adjoint against differences along one direction.
 
         Return a sentence if it is biased, else None.
@@ -535,7 +547,7 @@ class GradientBench:
         bench = gradients.Bench(exact, self._loss, self._u, seed, spp=64)
         probe = gradients.find_probes(bench)[0]
         differences = gradients.measure_reference(bench, probe, repeats=(2, 4))
-        slope = float(self.reference.value @ self.part.of(probe.direction))
+        slope = float(self.reference.value @ self.part.select(probe.direction))
         noise = self.reference.error * abs(slope)
         estimate = gradients.Estimate(
             self._reference_estimator, slope, noise, repeats=1, seconds=0.0
@@ -552,10 +564,10 @@ class GradientBench:
 
     def _take_gradient(
         self, renderer: gradients.Renderer, estimator: str, seed: int, spp: int
-    ) -> Array:
+    ) -> Float64Array:
         plan = gradients.restrict_plan(renderer.plan, self.part.group_names, estimator)
-        return self.part.of(
-            gradients.Bench(renderer, self._loss, self._u, seed, spp).gradient(
+        return self.part.select(
+            gradients.Bench(renderer, self._loss, self._u, seed, spp).compute_gradient(
                 plan, seed
             )
         )
@@ -575,7 +587,7 @@ def _make_row(
     )
 
 
-def flatten(values: Tensor) -> Array:
+def flatten(values: Tensor) -> Float64Array:
     """Return values as a flat float64 array."""
-    numbers: Array = values.detach().to(torch.float64).reshape(-1).numpy().copy()
+    numbers: Float64Array = values.detach().to(torch.float64).reshape(-1).numpy().copy()
     return numbers

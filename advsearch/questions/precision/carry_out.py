@@ -38,8 +38,8 @@ from advsearch.questions.precision.result import (
     PrecisionResult,
     Recommended,
     Sitting,
+    draw_figures,
     list_cautions,
-    precision_figures,
 )
 from advsearch.questions.precision.rule import (
     RoundUp,
@@ -51,15 +51,15 @@ from advsearch.questions.precision.rule import (
 )
 
 # fractions of the time by quantity; unused time is that of later ones
-SHARES = {"image": 0.6, "gradient": 0.4}
+TIME_FRACTIONS = {"image": 0.6, "gradient": 0.4}
 # fraction of a quantity's time for its reference
-REFERENCE_SHARE = 0.35
-CONFIRM_SHARE = 0.4
-CONFIRM_LEAST = 4
-CONFIRM_MOST = 64
+REFERENCE_FRACTION = 0.35
+CONFIRM_FRACTION = 0.4
+MIN_CONFIRMATIONS = 4
+MAX_CONFIRMATIONS = 64
 """Fraction of a gradient's time to measure the recommended setting again, and how often.
 
-It counts from `CONFIRM_LEAST` measurements on.
+It counts from `MIN_CONFIRMATIONS` measurements on.
 """
 
 
@@ -78,7 +78,7 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     problem, remarks = workbench.problem_from_config(config)
     for remark in remarks:
         context.progress.message(remark)
-    job = Measurement(config, problem, context.progress)
+    job = QuantityMeasurer(config, problem, context.progress)
     measurements = context.open_measurements()
     setup_seconds = time.perf_counter() - start_time
 
@@ -99,7 +99,7 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
         warnings = join("warnings")
         slopes = []
         for line in group_by_line(points).values():
-            slope = fit_line(line, job.or_steeper(line[0]))
+            slope = fit_line(line, job.may_be_steeper(line[0]))
             if slope is not None:
                 slopes.append(slope)
                 warnings += filter(None, [describe_disagreement(slope, line)])
@@ -119,7 +119,7 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
             left_out=join("left_out"),
             warnings=[*warnings, *list_cautions(points)],
             recommendations=recommend_settings(
-                points, join("again"), config.error, job.round_up, job.or_steeper
+                points, join("again"), config.error, job.round_up, job.may_be_steeper
             ),
             figures=[],
             seconds={"budget": config.seconds, "setup": setup_seconds},
@@ -128,12 +128,12 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     result = measurements.collect(measure_sittings(), make_result)
     written = [
         run.write_file(f"images/precision.{suffix}", data)
-        for suffix, data in precision_figures(result).items()
+        for suffix, data in draw_figures(result).items()
     ]
     return result.model_copy(update={"figures": [str(path) for path in written]})
 
 
-class Measurement:
+class QuantityMeasurer:
     """The quantities that can be measured.
 
     `sittings` has the name of each, its fraction of the time, and the function that
@@ -149,17 +149,21 @@ class Measurement:
         self._seed = seeds.stream(config.seed, "precision")
         self._is_linear = config.loss == "linear"
         self._renderer = problem.renderer
-        self._loss = cast(gradients.Loss, problem.loss)
+        self._loss = cast(gradients.Loss, problem.compute_loss)
         if self._is_linear:
-            self._renderer = problem.renderer.like(denoiser="none", transfer="linear")
-            self._renderer.plan = self._renderer.plan.at_a_pixel()
-            self._loss = gradients.smooth_loss(
+            self._renderer = problem.renderer.copy_with(
+                denoiser="none", transfer="linear"
+            )
+            self._renderer.plan = self._renderer.plan.with_pixel_steps()
+            self._loss = gradients.make_smooth_loss(
                 self._renderer.formation.resolution, config.seed
             )
 
         self.sittings: list[tuple[str, float, Callable[[TimeBudget], Sitting]]] = []
         if "image" in config.measured_quantities:
-            self.sittings.append(("image", SHARES["image"], self._measure_image))
+            self.sittings.append(
+                ("image", TIME_FRACTIONS["image"], self._measure_image)
+            )
         if "gradient" in config.measured_quantities:
             parts = list_gradient_parts(
                 self._renderer.plan.groups, linear=self._is_linear
@@ -170,7 +174,7 @@ class Measurement:
                     f"`controls` {names}: has no derivative; leave "
                     "gradient out of `quantities`"
                 )
-            share = SHARES["gradient"] / len(parts)
+            share = TIME_FRACTIONS["gradient"] / len(parts)
             for part in parts:
                 self.sittings.append(
                     (
@@ -192,9 +196,9 @@ class Measurement:
             if is_gradient
             else point.estimator.removesuffix(OIDN)
         )
-        return self._renderer.scene.next_count(samples, sampler)
+        return self._renderer.scene.round_sample_count(samples, sampler)
 
-    def or_steeper(self, point: PrecisionPoint) -> bool | None:
+    def may_be_steeper(self, point: PrecisionPoint) -> bool | None:
         """Return whether the error may fall faster than that of independent samples.
 
         None if theory says nothing: differences have the bias of their step, the
@@ -209,7 +213,7 @@ class Measurement:
     def _measure_image(self, budget: TimeBudget) -> Sitting:
         """Measure pictures and the model's margin on them."""
         problem = self._problem
-        u = problem.whole(problem.domain.start)
+        u = problem.add_conditions(problem.domain.start)
 
         def margin(image: torch.Tensor) -> float:
             return -problem.judge(image, u).score
@@ -225,16 +229,18 @@ class Measurement:
         title = f"gradient of {part.name}"
         start_time = time.perf_counter()
         bench = GradientBench(
-            renderer, self._loss, gradients.interior_point(renderer), part
+            renderer, self._loss, gradients.find_interior_point(renderer), part
         )
-        first_share = 1.0 - CONFIRM_SHARE * (1.0 - REFERENCE_SHARE)
-        sitting = self._measure_settings(title, bench, budget.share(first_share))
+        first_share = 1.0 - CONFIRM_FRACTION * (1.0 - REFERENCE_FRACTION)
+        sitting = self._measure_settings(
+            title, bench, budget.take_fraction(first_share)
+        )
         remark = None
         chosen = recommend_settings(
-            sitting.points, [], self._config.error, self.round_up, self.or_steeper
+            sitting.points, [], self._config.error, self.round_up, self.may_be_steeper
         )[0]
-        if budget.left > 0.0:
-            remark = bench.bias(self._seed)
+        if budget.seconds_left > 0.0:
+            remark = bench.check_bias(self._seed)
         again = self._confirm(title, bench, chosen, budget)
         warnings = [remark] if remark else []
         took = time.perf_counter() - start_time
@@ -267,22 +273,26 @@ class Measurement:
             [setting],
             bench.measure,
             budget,
-            rounds=CONFIRM_MOST,
+            rounds=MAX_CONFIRMATIONS,
             seed=seed,
             on_done=lambda _: tick(),
         )
         samples = [numbers["gradient"] for numbers in measured.results[setting]]
-        if len(samples) < CONFIRM_LEAST:
+        if len(samples) < MIN_CONFIRMATIONS:
             return []
-        return [summarize_samples(setting, samples, bench.floor(setting, "gradient"))]
+        return [
+            summarize_samples(
+                setting, samples, bench.reference_error(setting, "gradient")
+            )
+        ]
 
     def _measure_settings(
         self, title: str, bench: PictureBench | GradientBench, budget: TimeBudget
     ) -> Sitting:
         """Compute a bench's references, and measure all of its settings in rounds."""
         start_time = time.perf_counter()
-        share = budget.share(REFERENCE_SHARE)
-        references = bench.refer(
+        share = budget.take_fraction(REFERENCE_FRACTION)
+        references = bench.compute_references(
             share, self._seed, self._begin_stage(f"{title}: references", share)
         )
         tick = self._begin_stage(f"{title}: measuring every setting in rounds", budget)
@@ -302,11 +312,11 @@ class Measurement:
                     summarize_samples(
                         replace(setting, quantity=quantity),
                         numbers,
-                        bench.floor(setting, quantity),
+                        bench.reference_error(setting, quantity),
                     )
                 )
         skipped_counts: dict[str, list[str]] = {}
-        for setting in measured.left_out:
+        for setting in measured.skipped:
             skipped_counts.setdefault(f"{title} by {setting.estimator}", []).append(
                 str(setting.spp)
             )
@@ -323,7 +333,7 @@ class Measurement:
 
     def _begin_stage(self, name: str, budget: TimeBudget) -> Callable[..., None]:
         """Start a stage of the progress bar in seconds, and return what advances it."""
-        total = max(1, math.ceil(budget.left))
+        total = max(1, math.ceil(budget.seconds_left))
         done = 0
         self._progress.stage(
             name, total, hint="counted in seconds; `seconds` sets them", at_most=True
@@ -331,7 +341,7 @@ class Measurement:
 
         def tick(**info: float | str) -> None:
             nonlocal done
-            passed = min(total, total - math.ceil(budget.left))
+            passed = min(total, total - math.ceil(budget.seconds_left))
             self._progress.advance(passed - done, **info)
             done = passed
 
@@ -354,14 +364,14 @@ def group_by_line(
 
 def recommend_settings(
     points: Sequence[PrecisionPoint],
-    again: Sequence[PrecisionPoint],
+    confirmations: Sequence[PrecisionPoint],
     goal: float,
     round_up: RoundUp,
     or_steeper: Callable[[PrecisionPoint], bool | None] = lambda point: None,
 ) -> list[Recommended]:
     """Return the fastest setting that reaches a goal for each quantity, if any does.
 
-    A setting that was measured `again` is recommended by these measurements.
+    A setting that was measured `confirmations` is recommended by these measurements.
     """
     candidates: dict[tuple[str, ...], list[Recommended]] = {}
     for key, line in group_by_line(points).items():
@@ -376,7 +386,7 @@ def recommend_settings(
             key=lambda row: row.seconds or 0.0,
             default=Recommended(quantity=quantity, control=control),
         )
-        for point in again:
+        for point in confirmations:
             is_same = (point.control, point.estimator) == (best.control, best.estimator)
             if is_same and quantity == "gradient":
                 best = confirm_recommendation(best, point, round_up)

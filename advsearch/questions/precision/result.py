@@ -104,11 +104,11 @@ class PrecisionConfig(DerivativeConfig):
         known = QUANTITIES if info.field_name == "quantities" else SAMPLERS
         if not "".join(names).strip() or not set(names) <= set(known):
             raise ValueError("nothing, or unknown names")
-        settings.check_once(names, info.field_name)
+        settings.check_no_duplicates(names, info.field_name)
         return value
 
     @property
-    def title(self) -> tuple[str, ...]:
+    def title_words(self) -> tuple[str, ...]:
         return self.object, self.command
 
     @property
@@ -137,7 +137,7 @@ class PrecisionPoint(results.Measured):
     )
 
     @property
-    def known(self) -> bool:
+    def is_known(self) -> bool:
         """Whether the error is well above the reference's own; else it is an upper limit."""
         return self.status == "ok"
 
@@ -235,13 +235,13 @@ class PrecisionResult(RunResult):
     figures: list[str]
 
 
-WARM_UP = 3
+WARM_UP_CALLS = 3
 """Calls of a setting whose times don't count where there are more: the first compiles
 and records kernels, the second may record them again, and so may the first one after
 other scenes were rendered.
 """
-FAMILIES = {"none": " without denoiser", "oidn": " with denoiser"}
-READING = (
+FAMILY_SUFFIXES = {"none": " without denoiser", "oidn": " with denoiser"}
+READING_NOTE = (
     "Each row is a setting: its error beside a reference of far more samples, with the "
     "95 % interval of that "
     "error, and the processor time, in seconds, that one picture or gradient takes. A "
@@ -256,7 +256,7 @@ def describe_quantity(quantity: str, control: str = "") -> str:
     return f"the gradient of {control}" if quantity == "gradient" else f"the {quantity}"
 
 
-SLOPES: Mapping[str, views.Column] = {
+SLOPE_COLUMNS: Mapping[str, views.Column] = {
     "what": lambda slope: slope.control or slope.quantity,
     "estimator": "{0.estimator}",
     "slope": "{0.slope:.2f}",
@@ -273,7 +273,7 @@ SLOPES: Mapping[str, views.Column] = {
         None: "" if slope.theory is None else "can't be told",
     }[slope.agrees],
 }
-REFERENCES: Mapping[str, views.Column] = {
+REFERENCE_COLUMNS: Mapping[str, views.Column] = {
     "what": lambda reference: reference.control or reference.quantity,
     "reference": "{0.reference}",
     "samples": "{0.spp}",
@@ -282,7 +282,7 @@ REFERENCES: Mapping[str, views.Column] = {
 }
 
 
-def shown(result: PrecisionResult) -> ShownResult:
+def make_view(result: PrecisionResult) -> ShownResult:
     """Lay out a result: recommendations, errors, slopes and references."""
     machine = result.machine
     threads = " and ".join(
@@ -299,21 +299,21 @@ def shown(result: PrecisionResult) -> ShownResult:
                     for found in result.recommendations
                 ],
             ),
-            ResultPart(text=[READING], only="text"),
+            ResultPart(text=[READING_NOTE], only="text"),
             *(
                 _make_error_table(quantity, result.points)
                 for quantity in ("picture", "margin", "gradient")
             ),
             ResultPart.table(
                 result.slopes,
-                SLOPES,
+                SLOPE_COLUMNS,
                 title="Slopes: logarithm of the error against that of samples",
             ),
             ResultPart.table(
                 result.references,
-                REFERENCES,
+                REFERENCE_COLUMNS,
                 title="References, with their own errors",
-                note=READING,
+                note=READING_NOTE,
             ),
             ResultPart("Not measured, the time was up", result.left_out),
         ],
@@ -341,20 +341,22 @@ def make_headline(result: PrecisionResult) -> str:
     )
 
 
-def describe_recommendation(found: Recommended, goal: float) -> str:
+def describe_recommendation(recommendation: Recommended, goal: float) -> str:
     """Describe a recommended setting, or that none reaches the goal."""
-    quantity = describe_quantity(found.quantity, found.control)
-    goal_text = (
-        f"{100 * goal:.3g} % error of {quantity}{FAMILIES.get(found.family, '')}"
-    )
-    if found.estimator is None:
+    quantity = describe_quantity(recommendation.quantity, recommendation.control)
+    goal_text = f"{100 * goal:.3g} % error of {quantity}{FAMILY_SUFFIXES.get(recommendation.family, '')}"
+    if recommendation.estimator is None:
         return (
             f"{goal_text}: not reached by anything that was measured; give it more "
             "`seconds` or a larger `error`"
         )
-    basis = "" if found.basis in ("interpolated", "fitted") else f" ({found.basis})"
+    basis = (
+        ""
+        if recommendation.basis in ("interpolated", "fitted")
+        else f" ({recommendation.basis})"
+    )
     return (
-        f"{goal_text}: {found.estimator}, {found.spp} samples, {found.seconds:.2g} "
+        f"{goal_text}: {recommendation.estimator}, {recommendation.spp} samples, {recommendation.seconds:.2g} "
         f"s{basis}"
     )
 
@@ -434,12 +436,12 @@ COLORS = (
     "#a06a50",
 )
 MARKERS = "osD^vP*X<>d"
-PANEL = (5.6, 3.9)  # width and height of one diagram in inches
+PANEL_SIZE = (5.6, 3.9)  # width and height of one diagram in inches
 PERCENT = 100.0
 MINUS = "\N{MINUS SIGN}"
 
 
-def precision_figures(result: PrecisionResult) -> figures.Figures:
+def draw_figures(result: PrecisionResult) -> figures.Figures:
     """Return work-precision diagrams as files: error against seconds, both logarithmic.
 
     Filled markers are known errors; open ones with an arrow are limits: the reference
@@ -470,7 +472,9 @@ def precision_figures(result: PrecisionResult) -> figures.Figures:
         caption = _make_caption(result)
         figure.supxlabel(caption, fontsize=8, color=GREY, x=0.01, ha="left")
 
-    return figures.drawn(draw, (PANEL[0] * n_columns, PANEL[1] * n_rows + 0.8))
+    return figures.drawn(
+        draw, (PANEL_SIZE[0] * n_columns, PANEL_SIZE[1] * n_rows + 0.8)
+    )
 
 
 def _make_caption(result: PrecisionResult) -> str:
@@ -482,13 +486,15 @@ def _make_caption(result: PrecisionResult) -> str:
     )
     max_repeats = max(point.repeats for point in result.points)
     seconds = f"of the last of {max_repeats} repeats at most"
-    if max_repeats > WARM_UP + 1:
-        seconds = f"medians of at most {max_repeats - WARM_UP} interleaved repeats"
+    if max_repeats > WARM_UP_CALLS + 1:
+        seconds = (
+            f"medians of at most {max_repeats - WARM_UP_CALLS} interleaved repeats"
+        )
     legend = "Filled: known"
     if any(point.interval for point in result.points):
         legend += ", with its 95 % interval"
     legend += "."
-    if not all(point.known for point in result.points):
+    if not all(point.is_known for point in result.points):
         legend += " Open, with an arrow: at most this, the reference is no better."
     return (
         f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are "
@@ -603,9 +609,9 @@ def _draw_line(
             marker=marker,
             markersize=5,
             color=color,
-            markerfacecolor=color if point.known else "white",
+            markerfacecolor=color if point.is_known else "white",
         )
-        if not point.known:
+        if not point.is_known:
             arrow = {
                 "arrowstyle": "-|>",
                 "color": color,

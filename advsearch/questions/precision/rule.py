@@ -17,13 +17,13 @@ from scipy.special import stdtrit
 from scipy.stats import linregress
 
 from advsearch.questions.precision.result import (
-    WARM_UP,
+    WARM_UP_CALLS,
     PrecisionPoint,
     PrecisionSlope,
     Recommended,
 )
 
-Array = npt.NDArray[np.float64]
+Float64Array = npt.NDArray[np.float64]
 Numbers = Mapping[str, float]
 """One measurement: `error`, `cosine`, `seconds` of processor time and others; `fourth`
 is the sum of the fourth powers of all relative errors in a picture, whose squares
@@ -33,26 +33,26 @@ RoundUp = Callable[[PrecisionPoint, float], int]
 """From a point and a number of samples to the next number that its setting takes."""
 
 # multiple of the reference's own error above which a measured error is known
-KNOWN = 2.0
+MIN_ERROR_RATIO = 2.0
 # confidence of every interval
-LEVEL = 0.95
-WIDE = 1000
-LEAST_VALUES = 100
+CONFIDENCE = 0.95
+MIN_TAIL_SIZE = 1000
+MIN_ERROR_PIXELS = 100
 """Limits of heavy tails.
 
-For values of at least `WIDE` numbers it is checked how many of them hold the error. If
-these are fewer than `LEAST_VALUES`, in all measurements together, a few noisy pixels
+For values of at least `MIN_TAIL_SIZE` numbers it is checked how many of them hold the error. If
+these are fewer than `MIN_ERROR_PIXELS`, in all measurements together, a few noisy pixels
 decide it, and an interval would cover the truth too rarely (`benchmarks/precision.py
 --intervals`).
 """
 # difference from theory that a slope may have, whatever its interval
-AGREES = 0.1
+SLOPE_TOLERANCE = 0.1
 # slope of the error of a mean of independent samples against their number
-MONTE_CARLO = -0.5
+MONTE_CARLO_SLOPE = -0.5
 # multiple of the largest measured sample count up to which an error is extrapolated
-FURTHEST = 16.0
+MAX_EXTRAPOLATION = 16.0
 # minimum number of points of a fit
-LEAST_POINTS = 3
+MIN_FIT_POINTS = 3
 
 
 @dataclass(frozen=True)
@@ -78,15 +78,15 @@ class SampleSetting:
 class ReferenceValue:
     """A value (n,) that stands for the truth, with its relative error.
 
-    `size` is its norm, `parts` the number of independent parts that it is the mean of.
+    `norm` is its norm, `parts` the number of independent parts that it is the mean of.
     """
 
-    value: Array
+    value: Float64Array
     error: float
-    size: float
+    norm: float
     parts: int
 
-    def compare(self, value: Array) -> dict[str, float]:
+    def compare(self, value: Float64Array) -> dict[str, float]:
         """Compare a value (n,) with the reference.
 
         Returns:
@@ -96,21 +96,21 @@ class ReferenceValue:
             are too few numbers to tell tails.
         """
         difference = value - self.value
-        norm = float(np.linalg.norm(value)) * self.size
-        has_tails = len(value) >= WIDE and self.size > 0.0
+        norm = float(np.linalg.norm(value)) * self.norm
+        has_tails = len(value) >= MIN_TAIL_SIZE and self.norm > 0.0
         fourth = math.nan
         if has_tails:
-            fourth = float(np.sum((difference / self.size) ** 4))
+            fourth = float(np.sum((difference / self.norm) ** 4))
         return {
-            "error": relative_error(float(np.linalg.norm(difference)), self.size),
+            "error": relative_error(float(np.linalg.norm(difference)), self.norm),
             "cosine": float(value @ self.value) / norm if norm > 0.0 else math.nan,
             "fourth": fourth,
         }
 
 
 def estimate_reference(
-    parts: Sequence[Array],
-    function: Callable[[Array], Array] = lambda mean: mean,
+    parts: Sequence[Float64Array],
+    function: Callable[[Float64Array], Float64Array] = lambda mean: mean,
     bias: float = 0.0,
 ) -> ReferenceValue:
     """Return a function of the mean of independent parts, with its jackknife error.
@@ -153,22 +153,26 @@ def estimate_reference(
 
 
 def summarize_samples(
-    setting: SampleSetting, samples: Sequence[Numbers], floor: float = 0.0
+    setting: SampleSetting, samples: Sequence[Numbers], reference_error: float = 0.0
 ) -> PrecisionPoint:
     """Estimate the error of a setting from its measurements.
 
-    The noise of the samples and that of the reference (`floor`) are independent, so
+    The noise of the samples and that of the reference (`reference_error`) are independent, so
     that their squares add: error^2 = mean of squares - floor^2. A root mean square
-    below `KNOWN` times the floor is not known; the result is then a limit. The interval
+    below `MIN_ERROR_RATIO` times the floor is not known; the result is then a limit. The interval
     comes from the scatter of the squares on a logarithmic scale; a single measurement
     and heavy tails have none.
     """
     squares = [numbers["error"] ** 2 for numbers in samples]
     mean_square = statistics.fmean(squares)
     is_heavy = is_heavy_tailed(samples)
-    exceeds_floor = mean_square > (KNOWN * floor) ** 2
+    exceeds_floor = mean_square > (MIN_ERROR_RATIO * reference_error) ** 2
     is_known = exceeds_floor and math.isfinite(mean_square) and mean_square > 0.0
-    error = math.sqrt(mean_square - floor**2) if is_known else math.sqrt(mean_square)
+    error = (
+        math.sqrt(mean_square - reference_error**2)
+        if is_known
+        else math.sqrt(mean_square)
+    )
     interval = None
     if is_known and not is_heavy and len(squares) > 1:
         deviation = statistics.stdev(squares) / math.sqrt(len(squares))
@@ -183,7 +187,7 @@ def summarize_samples(
         "status": "ok" if is_known else "reference unusable",
         "error": error,
         "interval": interval,
-        "reference_error": floor,
+        "reference_error": reference_error,
         "heavy_tailed": is_heavy,
         "cosine": cosine,
     }
@@ -198,12 +202,12 @@ def _interval_factor(deviation: float, mean_square: float, count: int) -> float:
 
     The deviation is the standard error of the mean square of `count` values.
     """
-    quantile = float(stdtrit(count - 1, (1.0 + LEVEL) / 2.0))
+    quantile = float(stdtrit(count - 1, (1.0 + CONFIDENCE) / 2.0))
     return math.exp(min(50.0, quantile * (0.5 * deviation / mean_square)))
 
 
 def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
-    """Return whether fewer than `LEAST_VALUES` pixels hold the error of some pictures.
+    """Return whether fewer than `MIN_ERROR_PIXELS` pixels hold the error of some pictures.
 
     (sum of squares)^2 / (sum of fourth powers) is their number if all of them were
     equal. False if the pictures are too small to tell. What happens in none of the
@@ -211,12 +215,12 @@ def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
     """
     squares = sum(numbers["error"] ** 2 for numbers in samples)
     fourth = sum(numbers.get("fourth", math.nan) for numbers in samples)
-    return fourth > 0.0 and squares**2 < LEAST_VALUES * fourth
+    return fourth > 0.0 and squares**2 < MIN_ERROR_PIXELS * fourth
 
 
 def median_time(seconds: Sequence[float]) -> float:
     """Return the median of times without warm-up calls, or the last one if all are."""
-    return statistics.median(seconds[WARM_UP:] or seconds[-1:])
+    return statistics.median(seconds[WARM_UP_CALLS:] or seconds[-1:])
 
 
 def relative_error(error: float, size: float) -> float:
@@ -232,24 +236,26 @@ def fit_line(
     """Fit the line of log error against log samples by least squares.
 
     Only points with a known error count: one below the reference's own error says
-    nothing. None if fewer than `LEAST_POINTS` are left. Theory says `MONTE_CARLO`,
+    nothing. None if fewer than `MIN_FIT_POINTS` are left. Theory says `MONTE_CARLO_SLOPE`,
     `or_steeper`, or nothing (None). A slope disagrees if its interval excludes theory
-    *and* it differs by more than `AGREES`.
+    *and* it differs by more than `SLOPE_TOLERANCE`.
     """
-    known = [point for point in points if point.known]
-    if len({point.spp for point in known}) < LEAST_POINTS:
+    known = [point for point in points if point.is_known]
+    if len({point.spp for point in known}) < MIN_FIT_POINTS:
         return None
     line = linregress(
         np.log([float(point.spp) for point in known]),
         np.log([point.rms for point in known]),
     )
     slope = float(line.slope)
-    half_width = float(stdtrit(len(known) - 2, (1.0 + LEVEL) / 2.0)) * float(
+    half_width = float(stdtrit(len(known) - 2, (1.0 + CONFIDENCE) / 2.0)) * float(
         line.stderr
     )
-    difference = slope - MONTE_CARLO if or_steeper else abs(slope - MONTE_CARLO)
+    difference = (
+        slope - MONTE_CARLO_SLOPE if or_steeper else abs(slope - MONTE_CARLO_SLOPE)
+    )
     agrees: bool | None = False
-    if difference <= AGREES:
+    if difference <= SLOPE_TOLERANCE:
         agrees = True
     elif difference <= half_width:
         agrees = None
@@ -263,7 +269,7 @@ def fit_line(
         interval=(slope - half_width, slope + half_width),
         offset=float(line.intercept),
         points=len(known),
-        theory=None if or_steeper is None else MONTE_CARLO,
+        theory=None if or_steeper is None else MONTE_CARLO_SLOPE,
         or_steeper=bool(or_steeper),
         agrees=agrees,
     )
@@ -296,7 +302,7 @@ def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
     That is less than half as steep.
     """
     known = sorted(
-        (point for point in points if point.known), key=lambda point: point.spp
+        (point for point in points if point.is_known), key=lambda point: point.spp
     )
     steps = [
         math.log(b.rms / a.rms) / math.log(b.spp / a.spp)
@@ -322,7 +328,7 @@ def recommend_count(
     If the fitted line passes through the interval of every known point, of at least
     four, it stands for them. Otherwise the error is interpolated between points on
     logarithmic axes. Beyond the last one it follows the fitted slope, or that of theory
-    (see `fit_line`) if points are too few for a fit, at most `FURTHEST` times as far,
+    (see `fit_line`) if points are too few for a fit, at most `MAX_EXTRAPOLATION` times as far,
     and not at all if the line levels off. A limit counts as an error of that size. Time
     is interpolated, and beyond the last point grows with the samples.
     """
@@ -341,7 +347,7 @@ def recommend_count(
     if explaining_line:
         error = _error_on_line(explaining_line, spp)
     else:
-        slope = max(line.slope, -1.0) if line else MONTE_CARLO
+        slope = max(line.slope, -1.0) if line else MONTE_CARLO_SLOPE
         error = _interpolate_value(
             ordered, spp, [point.rms for point in ordered], slope
         )
@@ -364,10 +370,10 @@ def _error_on_line(line: PrecisionSlope, spp: float) -> float:
 
 def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) -> bool:
     """Return whether a falling line passes through the interval of every known point."""
-    if line.points <= LEAST_POINTS or not line.slope <= -0.1:
+    if line.points <= MIN_FIT_POINTS or not line.slope <= -0.1:
         return False
     for point in ordered:
-        if not point.known:
+        if not point.is_known:
             continue
         if not point.interval:
             return False
@@ -388,31 +394,35 @@ def _solve_line(
         return smallest, "measured"
     if samples <= largest:
         return samples, "fitted"
-    return (None if samples > FURTHEST * largest else samples), "extrapolated"
+    return (None if samples > MAX_EXTRAPOLATION * largest else samples), "extrapolated"
 
 
 def confirm_recommendation(
-    found: Recommended, point: PrecisionPoint, round_up: RoundUp = round_up_exactly
+    recommendation: Recommended,
+    point: PrecisionPoint,
+    round_up: RoundUp = round_up_exactly,
 ) -> Recommended:
     """Return a recommendation that rests on a point measured after it was selected.
 
     What looks cheapest among noisy points is mostly a lucky one, and its error looks
     smaller than it is. New measurements, with seeds of their own, don't have that bias.
     If their error is above the goal, the sample count grows as independent samples need
-    it, by (error / goal)^2, at most `FURTHEST` times, and the error shrinks by the
+    it, by (error / goal)^2, at most `MAX_EXTRAPOLATION` times, and the error shrinks by the
     root.
     """
-    assert found.goal is not None and found.spp is not None
+    assert recommendation.goal is not None and recommendation.spp is not None
     spp = round_up(
-        point, found.spp * min(FURTHEST, max(1.0, (point.rms / found.goal) ** 2))
+        point,
+        recommendation.spp
+        * min(MAX_EXTRAPOLATION, max(1.0, (point.rms / recommendation.goal) ** 2)),
     )
-    times = spp / found.spp
+    times = spp / recommendation.spp
     new = {
         "spp": spp,
         "seconds": point.seconds * times,
         "error": point.rms / math.sqrt(times),
     }
-    return found.model_copy(
+    return recommendation.model_copy(
         update={**new, "basis": "confirmed", "repeats": point.repeats}
     )
 
@@ -426,11 +436,20 @@ def _interpolate_count(
     """Return the samples from which on ordered points stay at or below a goal, and the basis."""
     last = ordered[-1]
     if last.rms > goal:
-        slope = line.slope if line else None if or_steeper is None else MONTE_CARLO
-        if slope is None or not last.known or slope > -0.1 or has_leveled_off(ordered):
+        slope = (
+            line.slope if line else None if or_steeper is None else MONTE_CARLO_SLOPE
+        )
+        if (
+            slope is None
+            or not last.is_known
+            or slope > -0.1
+            or has_leveled_off(ordered)
+        ):
             return None, ""
         factor = (goal / last.rms) ** (1.0 / max(slope, -1.0))
-        return (last.spp * factor if factor <= FURTHEST else None), "extrapolated"
+        return (
+            last.spp * factor if factor <= MAX_EXTRAPOLATION else None
+        ), "extrapolated"
     first = (
         max((at for at, point in enumerate(ordered) if point.rms > goal), default=-1)
         + 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from advsearch.extend import PositionalArgument, RunContext, experiment
-from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, shown
+from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, make_view
 
 
 @experiment(
@@ -20,7 +20,7 @@ from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, shown
     ),
     choices="advsearch.questions.recipe.description:titles",
     choice_description="advsearch.questions.recipe.description:describe",
-    view=shown,
+    view=make_view,
 )
 def recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     """Run a recipe: an experiment of several runs, with figures of them (docs/recipes.md).
@@ -28,6 +28,6 @@ def recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     Args:
         recipe: the name of a bundled recipe, or a YAML file.
     """
-    from advsearch.questions.recipe.carry_out import carried_out  # imports torch
+    from advsearch.questions.recipe.carry_out import run_recipe  # imports torch
 
-    return carried_out(context)
+    return run_recipe(context)

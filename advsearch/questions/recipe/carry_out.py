@@ -32,17 +32,17 @@ from advsearch.questions.recipe.description import (
     PHOTOGRAPHS,
     PlannedRun,
     Recipe,
-    first_of,
-    planned,
+    format_first_error,
+    plan_runs,
 )
 from advsearch.questions.recipe.rates import (
-    TRIAL,
-    TRIALS,
-    WORKERS,
-    MadeFigure,
+    TRIAL_COLUMN,
+    TRIAL_NAMES,
+    WORKERS_COLUMN,
+    FigureContent,
     Options,
     Rows,
-    frame_of,
+    make_frame,
     read_rows,
 )
 from advsearch.questions.recipe.result import (
@@ -53,35 +53,41 @@ from advsearch.questions.recipe.result import (
 )
 
 # a full turn, degrees
-TURN = 360.0
+FULL_TURN = 360.0
 # the note of a run's store that holds the recipe, so that a resumed run repeats it
-NOTE = "recipe"
+RECIPE_NOTE = "recipe"
 # with the result of an attack or of a sweep
 DoneRun = tuple[PlannedRun, Any]
 
 FIGURES: Mapping[str, tuple[type[Options], Any]] = {
-    "rates": (rates.RatesOptions, rates.rates),
-    "answers": (given.PredictionsOptions, given.predictions),
-    "cues": (given.CuesOptions, given.cues),
-    "ternary": (given.TernaryOptions, given.ternary),
-    "agreement": (rates.AgreementOptions, rates.agreement),
-    "scaling": (Options, rates.scaling),
-    "surface": (Options, rates.surface),
+    "rates": (rates.RatesOptions, rates.make_rates_figure),
+    "answers": (given.PredictionsOptions, given.make_predictions_figure),
+    "cues": (given.CuesOptions, given.make_cues_figure),
+    "ternary": (given.TernaryOptions, given.make_ternary_figure),
+    "agreement": (rates.AgreementOptions, rates.make_agreement_figure),
+    "scaling": (Options, rates.make_scaling_figure),
+    "surface": (Options, rates.make_surface_figure),
 }
 """The options of each kind of figure, and the function that makes it of rows."""
 
-TOGETHER = ("agreement", "scaling", "surface")
+COMPARES_MODELS = ("agreement", "scaling", "surface")
 """Kinds of figures that show all models; of the other kinds each model has its own."""
 
 # options of figures that name columns
-NAMING = ("by", "series", "texture", "shape", "shares")
+COLUMN_OPTIONS = ("by", "series", "texture", "shape", "shares")
 # columns of every recipe
-OUTER = ("object", "environment", rates.MODEL, rates.PREDICTION, rates.PART)
+COMMON_COLUMNS = (
+    "object",
+    "environment",
+    rates.MODEL_COLUMN,
+    rates.PREDICTION_COLUMN,
+    rates.PART_COLUMN,
+)
 # stands for the parameters of a control that does not declare them
-ANY = "*"
+ANY_PARAMETER = "*"
 
 
-def carried_out(context: RunContext[RecipeConfig]) -> RecipeResult:
+def run_recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     """Run a recipe, except for the parts that are already finished.
 
     Raises:
@@ -91,12 +97,12 @@ def carried_out(context: RunContext[RecipeConfig]) -> RecipeResult:
     if config.photographs is not None and not Path(config.photographs).is_dir():
         raise InputError(f"photographs: expected a folder, got {config.photographs}")
     recipe = _load_recipe(context)
-    runs = planned(recipe, config)
+    runs = plan_runs(recipe, config)
     description.check_powers(recipe, runs, config.recipe)
     if _read_noted_recipe(context) is None:
-        check_described(recipe, config)
+        check_recipe(recipe, config)
         check_figures(recipe, check_runs(runs), config.recipe)
-    context.run.store.set_note(NOTE, json.dumps(recipe.model_dump(mode="json")))
+    context.run.store.set_note(RECIPE_NOTE, json.dumps(recipe.model_dump(mode="json")))
 
     done, warnings = _run_parts(runs, context)
     recipe_figures = list[RecipeFigure]()
@@ -121,7 +127,7 @@ def _read_noted_recipe(context: RunContext[RecipeConfig]) -> dict[str, Any] | No
     if resumed is None or not Store.is_in(resumed):
         return None
     with Store.open_to_read(resumed) as store:
-        return store.noted(NOTE) or None
+        return store.noted(RECIPE_NOTE) or None
 
 
 def _load_recipe(context: RunContext[RecipeConfig]) -> Recipe:
@@ -129,7 +135,7 @@ def _load_recipe(context: RunContext[RecipeConfig]) -> Recipe:
     noted = _read_noted_recipe(context)
     if noted is None:
         return description.read_recipe(context.config.recipe)
-    return description.recipe_of(
+    return description.parse_recipe(
         noted, f"{context.resumed}: the recipe that it began with"
     )
 
@@ -143,14 +149,14 @@ def _make_result(
 ) -> RecipeResult:
     """Make the result of a recipe; a resumed run adds the seconds it took before."""
     config = context.config
-    recipe_settings = description.made_of(recipe, config).settings
+    recipe_settings = description.apply_command_settings(recipe, config).settings
     defaults = {
         "object": "",
         "environment": SceneConfig.default_environment,
         "model": "reference",
     }
     names = {
-        setting: description.names_listed(recipe_settings.get(setting) or default)
+        setting: description.split_name_list(recipe_settings.get(setting) or default)
         for setting, default in defaults.items()
     }
     controls = [name for run, _ in done for name in run.config.controls]
@@ -186,14 +192,14 @@ def _make_result(
     return result
 
 
-def check_described(recipe: Recipe, config: RecipeConfig) -> None:
+def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
     """Check the photographs and figures of a recipe before anything is rendered.
 
     Raises:
         InputError: if something that the recipe describes cannot work.
     """
     if config.photographs is not None:
-        photographed = _select_photographed(recipe, planned(recipe, config))
+        photographed = _select_photographed(recipe, plan_runs(recipe, config))
         if not photographed:
             raise InputError(
                 f"photographs: {config.recipe} keeps no pictures to compare them with; "
@@ -204,7 +210,7 @@ def check_described(recipe: Recipe, config: RecipeConfig) -> None:
             directory = Path(config.photographs) / Path(run.config.object).stem
             photographs.list_files(directory, run.config.task)
     for figure in recipe.figures:
-        kind, _ = read_options(figure, config.recipe)
+        kind, _ = read_figure_options(figure, config.recipe)
         if kind == "cues" and config.task_name == wording.DETECTION:
             raise InputError(
                 f"task: {config.recipe} asks whether predictions are classes of the "
@@ -225,16 +231,16 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
         # runs that differ in these alone are loaded once
         distinct_settings = {
             name: value
-            for name, value in run.config.plain().items()
-            if name not in ("seed", WORKERS)
+            for name, value in run.config.to_json().items()
+            if name not in ("seed", WORKERS_COLUMN)
         }
         key = f"{distinct_settings} {run.around}"
         if key not in parameters_of_settings:
             search = config_of_run[run.around] if run.around else None
             parameters_of_settings[key] = _check_run(run.config, search)
         columns[run.part] |= parameters_of_settings[key]
-        if getattr(run.config, WORKERS, None) is not None:
-            columns[run.part].add(WORKERS)
+        if getattr(run.config, WORKERS_COLUMN, None) is not None:
+            columns[run.part].add(WORKERS_COLUMN)
     return columns
 
 
@@ -247,7 +253,7 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
         return workbench.row_parameters(config)
     columns = set[str]()
     if search is None:
-        columns.add(TRIAL)  # rows of an attack are its trials
+        columns.add(TRIAL_COLUMN)  # rows of an attack are its trials
         assert isinstance(config, AttackConfig)
         workbench.check_from_config(config)
     source = search or config
@@ -256,7 +262,9 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
         parameters = []
         if kind in workbench.CONTROLS:
             parameters = [each.name for each in workbench.CONTROLS[kind].parameters]
-        columns |= {f"{name}.{parameter}" for parameter in parameters or [ANY]}
+        columns |= {
+            f"{name}.{parameter}" for parameter in parameters or [ANY_PARAMETER]
+        }
     return columns
 
 
@@ -274,7 +282,7 @@ def check_figures(
         InputError: if a part or a column does not exist.
     """
     for index, described in enumerate(recipe.figures, start=1):
-        kind, options = read_options(described, where)
+        kind, options = read_figure_options(described, where)
         location = f"It stands in {where}, figure {index} ({kind})"
         baseline = getattr(options, "beside", None)
         option_parts = [("of", part) for part in options.of]
@@ -293,7 +301,7 @@ def check_figures(
         }
         if not columns_of_part:
             continue
-        for option in NAMING:
+        for option in COLUMN_OPTIONS:
             value = getattr(options, option, None) or ()
             names = [value] if isinstance(value, str) else value
             for name in names:
@@ -312,11 +320,11 @@ def _check_column(
     Raises:
         InputError: if no part has it, or only some have.
     """
-    known = {*OUTER, *([rates.GROUP] if recipe.groups else [])}
+    known = {*COMMON_COLUMNS, *([rates.GROUP_COLUMN] if recipe.groups else [])}
     if name in known:
         return
     # a control that does not declare its parameters may have this one
-    matching = {name, f"{name.partition('.')[0]}.{ANY}"}
+    matching = {name, f"{name.partition('.')[0]}.{ANY_PARAMETER}"}
     lacking = [
         part
         for part, columns in columns_of_part.items()
@@ -324,7 +332,9 @@ def _check_column(
     ]
     if len(lacking) == len(columns_of_part):
         for columns in columns_of_part.values():
-            known |= {column for column in columns if not column.endswith(ANY)}
+            known |= {
+                column for column in columns if not column.endswith(ANY_PARAMETER)
+            }
         raise errors.UnknownNameError(
             "column", name, known, f"{location}, as `{option}`."
         )
@@ -379,7 +389,9 @@ def _run_parts(
                     f"{run.part} is left out for it."
                 )
                 continue
-            config = around(config, search.distribution, search.configuration or {})
+            config = sample_around(
+                config, search.distribution, search.configuration or {}
+            )
         result = context.run_part(run.name, config)
         done.append((run, result))
         if result.goes_on:
@@ -387,8 +399,8 @@ def _run_parts(
     return done, left_out
 
 
-def around(
-    config: SceneConfig, distribution: Any, searched: Mapping[str, Any]
+def sample_around(
+    config: SceneConfig, distribution: Any, search_ranges: Mapping[str, Any]
 ) -> SceneConfig:
     """Return settings that sample uniformly around the distribution a search found.
 
@@ -399,7 +411,7 @@ def around(
     Args:
         config: settings of the run that samples.
         distribution: mean of each parameter, and deviations as fractions of ranges.
-        searched: the parameters of the search with their ranges.
+        search_ranges: the parameters of the search with their ranges.
     """
     controls: dict[str, dict[str, object]] = {}
     for (name, mean), deviation in zip(
@@ -412,7 +424,10 @@ def around(
             if known.name == parameter_name
         )
         controls.setdefault(control, {})[parameter_name] = _range_around(
-            mean.value, deviation, (searched[name].low, searched[name].high), parameter
+            mean.value,
+            deviation,
+            (search_ranges[name].low, search_ranges[name].high),
+            parameter,
         )
     return config.model_copy(update={"controls": controls, "sampler": "random"})
 
@@ -431,8 +446,8 @@ def _range_around(
     to_scale = math.log if parameter.log else float
     lower, upper, center = (to_scale(value) for value in (*search_range, mean))
     half_width = math.sqrt(3.0) * deviation * (upper - lower)
-    if parameter.periodic and upper - lower >= TURN:
-        half_width = min(half_width, TURN / 2)
+    if parameter.periodic and upper - lower >= FULL_TURN:
+        half_width = min(half_width, FULL_TURN / 2)
         bounds = [center - half_width, center + half_width]
     else:
         bounds = [max(center - half_width, lower), min(center + half_width, upper)]
@@ -442,13 +457,13 @@ def _range_around(
 
 
 def _add_photographs(
-    folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory
+    folder: Path, runs: Sequence[PlannedRun], run: RunDirectory
 ) -> list[str]:
     """Add photographs to the runs that they are compared with.
 
     Args:
         folder: has a directory of photographs for each object, of its name.
-        wanted: the runs to add them to.
+        runs: the runs to add them to.
         run: the run of the recipe.
 
     Returns:
@@ -459,7 +474,7 @@ def _add_photographs(
     """
     photographs = workbench.load_photographs()
     missing = list[str]()
-    for planned_run in wanted:
+    for planned_run in runs:
         object_name = planned_run.config.object
         directory = folder / Path(object_name).stem
         files = photographs.list_files(directory, planned_run.config.task)
@@ -467,8 +482,8 @@ def _add_photographs(
         photographs.add_files(part, files)
         if not files:
             missing.append(f"{object_name}: {directory} has no photographs.")
-    if len(missing) == len(wanted):
-        stems = [Path(planned_run.config.object).stem for planned_run in wanted[:8]]
+    if len(missing) == len(runs):
+        stems = [Path(planned_run.config.object).stem for planned_run in runs[:8]]
         raise InputError(
             "photographs: expected some in a folder for each object "
             f"({', '.join(stems)}) in {folder}, got none"
@@ -486,11 +501,13 @@ def _write_figures(
     rows = _read_frame(recipe, done, recipe_run)
     number = 0
     # all options are read before the first figure is made
-    kinds = [read_options(described, config.recipe) for described in recipe.figures]
+    kinds = [
+        read_figure_options(described, config.recipe) for described in recipe.figures
+    ]
     for kind, options in kinds:
-        for figure in make(rows, kind, options):
+        for figure in make_figures(rows, kind, options):
             number += 1
-            for suffix, data in files_of(figure).items():
+            for suffix, data in draw_files(figure).items():
                 recipe_run.write_file(f"images/figure-{number}.{suffix}", data)
             yield RecipeFigure.of({"figure": kind, **vars(figure)})
 
@@ -503,7 +520,7 @@ def _read_frame(
     units = dict[str, str]()
     surfaces = dict[str, Any]()
     for run, result in done:
-        row_kinds: dict[str, Sequence[str]] = {run.part: tuple(TRIALS)}
+        row_kinds: dict[str, Sequence[str]] = {run.part: tuple(TRIAL_NAMES)}
         if isinstance(run.config, SweepConfig):
             row_kinds = {
                 run.part: ("sweep",),
@@ -511,8 +528,8 @@ def _read_frame(
             }
             if result.surface:
                 surfaces[run.name] = result.surface
-        workers = getattr(run.config, WORKERS, None)
-        more = {} if workers is None else {WORKERS: workers}
+        workers = getattr(run.config, WORKERS_COLUMN, None)
+        more = {} if workers is None else {WORKERS_COLUMN: workers}
         folder = RunDirectory.locate_part(recipe_run.path, run.name)
         for part, kinds in row_kinds.items():
             part_rows, part_units = read_rows(
@@ -520,7 +537,7 @@ def _read_frame(
             )
             rows += part_rows
             units |= part_units
-    return frame_of(
+    return make_frame(
         rows,
         recipe.groups,
         units=units,
@@ -530,39 +547,47 @@ def _read_frame(
     )
 
 
-def read_options(described: Mapping[str, object], where: str) -> tuple[str, Options]:
+def read_figure_options(
+    figure_entry: Mapping[str, object], where: str
+) -> tuple[str, Options]:
     """Return the kind of a figure and its options.
 
     Raises:
         InputError: if the kind or an option does not exist, or a value is wrong.
     """
-    kind = str(described.get("figure", ""))
+    kind = str(figure_entry.get("figure", ""))
     if kind not in FIGURES:
         raise errors.UnknownNameError("figure", kind, FIGURES, f"It stands in {where}.")
     options_type, _ = FIGURES[kind]
-    values = {name: value for name, value in described.items() if name != "figure"}
+    values = {name: value for name, value in figure_entry.items() if name != "figure"}
     try:
         return kind, options_type(**values)
     except ValidationError as error:
         raise errors.FileFormatError(
-            f"{where}: figures: {kind}: {first_of(error)}; see docs/recipes.md"
+            f"{where}: figures: {kind}: {format_first_error(error)}; see docs/recipes.md"
         ) from None
 
 
-def make(rows: Rows, kind: str, options: Options) -> Iterator[MadeFigure]:
+def make_figures(rows: Rows, kind: str, options: Options) -> Iterator[FigureContent]:
     """Yield a figure, or one for each model if the kind does not compare models.
 
     Raises:
         InputError: if the rows lack what the figure needs.
     """
-    part = rows[rates.PART]
+    part = rows[rates.PART_COLUMN]
     _, make_figure = FIGURES[kind]
-    is_selected = part.isin(options.parts) if options.parts else part != PHOTOGRAPHS
+    is_selected = (
+        part.isin(options.required_parts)
+        if options.required_parts
+        else part != PHOTOGRAPHS
+    )
     selected = rows[is_selected]
-    compares_models = kind in TOGETHER or rates.MODEL in vars(options).values()
+    compares_models = (
+        kind in COMPARES_MODELS or rates.MODEL_COLUMN in vars(options).values()
+    )
     rows_of_model = {"": selected}
-    if not compares_models and rates.MODEL in selected:
-        rows_of_model = rates.by(selected, rates.MODEL)
+    if not compares_models and rates.MODEL_COLUMN in selected:
+        rows_of_model = rates.split_rows(selected, rates.MODEL_COLUMN)
     for model, model_rows in rows_of_model.items():
         figure = make_figure(model_rows, options)
         title = options.title or figure.title
@@ -571,11 +596,13 @@ def make(rows: Rows, kind: str, options: Options) -> Iterator[MadeFigure]:
         yield replace(figure, title=title)
 
 
-def files_of(made: MadeFigure) -> dict[str, bytes]:
+def draw_files(figure_content: FigureContent) -> dict[str, bytes]:
     """Draw a figure, and return its files by suffix."""
 
     def draw(figure: Any) -> None:
-        figure.suptitle(made.title, x=0.01, ha="left", fontsize=10, fontweight="bold")
-        made.draw(figure)
+        figure.suptitle(
+            figure_content.title, x=0.01, ha="left", fontsize=10, fontweight="bold"
+        )
+        figure_content.draw(figure)
 
-    return figures.drawn(draw, made.size)
+    return figures.drawn(draw, figure_content.size)

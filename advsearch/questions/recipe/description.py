@@ -30,12 +30,12 @@ CONFIGS: Mapping[str, type[SceneConfig]] = {
 """The settings of a part, by its command."""
 # the part that the rows of photographs belong to
 PHOTOGRAPHS = "photographs"
-OF_THE_COMMAND = (*settings.PLACE, "seed", "threads", "deterministic")
+COMMAND_SETTINGS = (*settings.RUN_LOCATION, "seed", "threads", "deterministic")
 """Settings that belong to the command line and not into a recipe's file."""
 
-MOST_PARTS = 64
-MOST_FIGURES = 32
-MOST_RUNS = 1000
+MAX_PARTS = 64
+MAX_FIGURES = 32
+MAX_RUNS = 1000
 
 BUNDLED = resources.files("advsearch.questions.recipe")
 
@@ -64,7 +64,7 @@ class Part(_Described):
     @classmethod
     def _reject_per_run_settings(cls, value: Settings) -> Settings:
         """Reject settings that are the same for all parts."""
-        for name in (*OF_THE_COMMAND, "object", "label"):
+        for name in (*COMMAND_SETTINGS, "object", "label"):
             if name in value:
                 raise ValueError(
                     f"{name!r} is the same for all parts; leave it out here"
@@ -96,8 +96,8 @@ class Recipe(_Described):
     title: Annotated[str, Field(min_length=1, max_length=200)]
     about: Annotated[str, Field(max_length=2000)] = ""
     settings: Settings = Field(default_factory=dict)
-    parts: Annotated[dict[str, Part], Field(min_length=1, max_length=MOST_PARTS)]
-    figures: Annotated[list[dict[str, Any]], Field(max_length=MOST_FIGURES)] = Field(
+    parts: Annotated[dict[str, Part], Field(min_length=1, max_length=MAX_PARTS)]
+    figures: Annotated[list[dict[str, Any]], Field(max_length=MAX_FIGURES)] = Field(
         default_factory=list
     )
     groups: dict[str, list[str]] = Field(default_factory=dict)
@@ -107,7 +107,7 @@ class Recipe(_Described):
     @classmethod
     def _reject_command_settings(cls, value: Settings) -> Settings:
         """Reject settings that belong to the command line."""
-        for name in OF_THE_COMMAND:
+        for name in COMMAND_SETTINGS:
             if name in value:
                 raise ValueError(
                     f"{name!r} is said with the command, not in its file; leave it out"
@@ -137,7 +137,7 @@ class Recipe(_Described):
             earlier.append(name)
         return value
 
-    def made_quick(self) -> Recipe:
+    def apply_quick(self) -> Recipe:
         """Return the recipe with the changes of `quick`.
 
         Raises:
@@ -153,17 +153,17 @@ class Recipe(_Described):
             if name in self.quick.without:
                 continue
             changes = self.quick.parts.get(name, {})
-            part_settings = settings.merged(part.settings, changes)
+            part_settings = settings.merge_mappings(part.settings, changes)
             parts[name] = part.model_copy(update={"settings": part_settings})
         return self.model_copy(
             update={
-                "settings": settings.merged(self.settings, self.quick.settings),
+                "settings": settings.merge_mappings(self.settings, self.quick.settings),
                 "parts": parts,
             }
         )
 
 
-def recipe_names() -> tuple[str, ...]:
+def list_recipes() -> tuple[str, ...]:
     """Return the names of the bundled recipes, sorted."""
     files = (path.name for path in BUNDLED.iterdir())
     return tuple(sorted(name[:-5] for name in files if name.endswith(".yaml")))
@@ -171,20 +171,20 @@ def recipe_names() -> tuple[str, ...]:
 
 def titles() -> dict[str, str]:
     """Return the titles of the bundled recipes by name."""
-    return {name: read_recipe(name).title for name in recipe_names()}
+    return {name: read_recipe(name).title for name in list_recipes()}
 
 
-def recipe_yaml(name: str) -> str:
+def read_recipe_text(name: str) -> str:
     """Return the text of a bundled recipe's file.
 
     Raises:
         UnknownNameError: if there is no such recipe.
     """
-    if name not in recipe_names():
+    if name not in list_recipes():
         raise errors.UnknownNameError(
             "recipe",
             name,
-            recipe_names(),
+            list_recipes(),
             "A recipe of your own is a YAML file: give its path.",
         )
     return str((BUNDLED / f"{name}.yaml").read_text(encoding="utf-8"))
@@ -192,7 +192,7 @@ def recipe_yaml(name: str) -> str:
 
 def describe(name: str) -> tuple[str, dict[str, Any]]:
     """Return the text of a bundled recipe, and its content as JSON values."""
-    text = recipe_yaml(name).rstrip("\n")
+    text = read_recipe_text(name).rstrip("\n")
     return text, read_recipe(name).model_dump(mode="json")
 
 
@@ -202,10 +202,10 @@ def read_recipe(name: str) -> Recipe:
     A path has a suffix or a directory.
     """
     if is_file_name(name):
-        return recipe_of(settings.read_yaml(name), name)
-    recipe_yaml(name)  # an unknown name is an error
+        return parse_recipe(settings.read_yaml(name), name)
+    read_recipe_text(name)  # an unknown name is an error
     with resources.as_file(BUNDLED / f"{name}.yaml") as path:
-        return recipe_of(settings.read_yaml(path), name)
+        return parse_recipe(settings.read_yaml(path), name)
 
 
 def is_file_name(name: str) -> bool:
@@ -213,7 +213,7 @@ def is_file_name(name: str) -> bool:
     return "/" in name or Path(name).suffix != ""
 
 
-def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
+def parse_recipe(data: Mapping[str, object], where: str) -> Recipe:
     """Parse the content of a recipe's file; `where` names the file in messages.
 
     Raises:
@@ -226,7 +226,7 @@ def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
         return Recipe(**values)
     except ValidationError as error:
         raise errors.FileFormatError(
-            f"{where}: {first_of(error)}; advsearch show recipe backgrounds prints one"
+            f"{where}: {format_first_error(error)}; advsearch show recipe backgrounds prints one"
         ) from None
     except (RecursionError, TypeError) as error:
         raise errors.FileFormatError(
@@ -234,7 +234,7 @@ def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
         ) from None
 
 
-def first_of(error: ValidationError) -> str:
+def format_first_error(error: ValidationError) -> str:
     """Format the first problem: ``parts.a.shell: Extra inputs are not permitted``."""
     first = error.errors(include_url=False, include_input=False)[0]
     location = ".".join(map(str, first["loc"]))
@@ -252,7 +252,7 @@ class PlannedRun:
     around: str | None
 
 
-def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
+def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     """Plan the runs of a recipe in the order in which they run.
 
     A run has one object; a search has one environment and one model too.
@@ -261,7 +261,7 @@ def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
         InputError: if a part has a setting that its command lacks, or there are too
             many runs.
     """
-    recipe = made_of(recipe, config)
+    recipe = apply_command_settings(recipe, config)
     runs = list[PlannedRun]()
     for name, part in recipe.parts.items():
         axes = _list_axes(recipe, part)
@@ -273,12 +273,12 @@ def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
                 for axis, value in value_of_axis.items()
                 if axis == "object" or len(axes[axis]) > 1
             ]
-            suffix = f"{index:02d}-{folder_name(words)}"
+            suffix = f"{index:02d}-{make_directory_name(words)}"
             around = f"{part.around}-{suffix}" if part.around else part.around
             runs.append(PlannedRun(f"{name}-{suffix}", name, run_config, around))
-    if len(runs) > MOST_RUNS:
+    if len(runs) > MAX_RUNS:
         raise InputError(
-            f"{config.recipe}: expected at most {MOST_RUNS} runs, got "
+            f"{config.recipe}: expected at most {MAX_RUNS} runs, got "
             f"{len(runs)}; name fewer objects"
         )
     return runs
@@ -292,7 +292,7 @@ def _list_axes(recipe: Recipe, part: Part) -> dict[str, list[str]]:
         defaults["model"] = "reference"
     part_settings = {**recipe.settings, **part.settings}
     return {
-        axis: names_listed(part_settings.get(axis) or default)
+        axis: split_name_list(part_settings.get(axis) or default)
         for axis, default in defaults.items()
     }
 
@@ -318,7 +318,7 @@ def _make_run_config(
         run_settings["deterministic"] = True
     else:
         run_settings["threads"] = config.threads
-    label = config.label_of(value_of_axis["object"])
+    label = config.find_label(value_of_axis["object"])
     if label is not None:
         run_settings["label"] = label
     where = f"{config.recipe}: parts: {name}"
@@ -333,7 +333,7 @@ def _make_run_config(
         raise InputError(f"{where}: {error}") from None
 
 
-def folder_name(words: Iterable[str]) -> str:
+def make_directory_name(words: Iterable[str]) -> str:
     """Join names, or the stems of files, to the name of a directory: ``mug-studio``."""
     first, *others = words
     names = [Path(first).stem, *(_safe_name(Path(other).stem) for other in others)]
@@ -359,14 +359,14 @@ def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
             run.config.check_powers(f"{name}: parts: {run.part}")
 
 
-def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
+def apply_command_settings(recipe: Recipe, config: RecipeConfig) -> Recipe:
     """Return the recipe with the settings of the command, and of `quick` if it is set.
 
     Raises:
         InputError: if neither names an object.
     """
     if config.quick:
-        recipe = recipe.made_quick()
+        recipe = recipe.apply_quick()
     names = (
         "object",
         "environment",
@@ -391,7 +391,7 @@ def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
     return recipe.model_copy(update={"settings": merged})
 
 
-def names_listed(value: object) -> list[str]:
+def split_name_list(value: object) -> list[str]:
     """Return the names of a list, or of a text in which commas separate them."""
     if isinstance(value, (list, tuple)):
         return [str(name) for name in value]

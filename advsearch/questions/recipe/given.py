@@ -15,14 +15,19 @@ from pydantic import Field
 
 from advsearch.extend import figures, statistics, wording
 from advsearch.questions.recipe import rates
-from advsearch.questions.recipe.rates import MadeFigure, Options, Rows, Tally
+from advsearch.questions.recipe.rates import (
+    ClusteredFraction,
+    FigureContent,
+    Options,
+    Rows,
+)
 
 # characters that fit into a bar of the full width, and the least of a name cut short
-LETTERS = 85
-FEWEST_LETTERS = 4
+MAX_LETTERS = 85
+MIN_LETTERS = 4
 
 # a prediction with its count, and how many of these predictions are correct
-PredictionCount = tuple[Tally, int]
+PredictionCount = tuple[ClusteredFraction, int]
 
 
 class PredictionsOptions(Options):
@@ -32,15 +37,15 @@ class PredictionsOptions(Options):
     most: int = Field(default=4, ge=1, le=10)
 
 
-def predictions(rows: Rows, options: PredictionsOptions) -> MadeFigure:
+def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureContent:
     """Make a figure of the most frequent predictions by the values of a column."""
     groups = dict[str, list[PredictionCount]]()
-    for value, group_rows in rates.by(rows, options.by).items():
+    for value, group_rows in rates.split_rows(rows, options.by).items():
         groups[value] = []
-        ranking = rates.most_frequent(group_rows[rates.PREDICTION])
+        ranking = rates.rank_predictions(group_rows[rates.PREDICTION_COLUMN])
         for label, _ in ranking[: options.most]:
-            flags = group_rows[rates.PREDICTION] == label
-            tally = Tally.over(label, group_rows, flags)
+            flags = group_rows[rates.PREDICTION_COLUMN] == label
+            tally = ClusteredFraction.from_rows(label, group_rows, flags)
             n_right = int(group_rows["correct"][flags].sum())
             groups[value].append((tally, n_right))
 
@@ -59,11 +64,13 @@ def predictions(rows: Rows, options: PredictionsOptions) -> MadeFigure:
     table = list[list[rates.Cell]]()
     for value, counts in groups.items():
         for tally, n_right in counts:
-            table.append([value, tally.name, *tally.cells, n_right])
-    heads = [options.by, "prediction", "given in", *rates.COUNT, "right"]
+            table.append([value, tally.name, *tally.table_cells, n_right])
+    heads = [options.by, "prediction", "given in", *rates.FRACTION_HEADS, "right"]
     title = f"Most frequent predictions by {options.by}"
-    text = _describe_predictions(groups, rates.plural(options.by))
-    return MadeFigure(title, text, heads, table, draw, (6.4, 1.2 + 0.3 * len(groups)))
+    text = _describe_predictions(groups, rates.pluralize_column(options.by))
+    return FigureContent(
+        title, text, heads, table, draw, (6.4, 1.2 + 0.3 * len(groups))
+    )
 
 
 def _describe_predictions(
@@ -73,9 +80,9 @@ def _describe_predictions(
     sentences = list[str]()
     for value, counts in groups.items():
         tally, n_right = counts[0]
-        if 2 * n_right < tally.times:
+        if 2 * n_right < tally.n_counted:
             sentences.append(
-                f"For {value} it is {tally.name}, {tally.told('given')} and right in "
+                f"For {value} it is {tally.name}, {tally.describe('given')} and right in "
                 f"{n_right} of these."
             )
     n_mostly_right = len(groups) - len(sentences)
@@ -92,8 +99,8 @@ def _draw_stacked_bar(
     """Draw the most frequent predictions side by side, and all others in gray."""
     left = 0.0
     for tally, n_right in counts:
-        share = tally.share or 0.0
-        is_mostly_right = 2 * n_right >= tally.times
+        share = tally.fraction or 0.0
+        is_mostly_right = 2 * n_right >= tally.n_counted
         axes.barh(
             position,
             share,
@@ -106,7 +113,7 @@ def _draw_stacked_bar(
         axes.text(
             left + share / 2,
             position,
-            fitting(tally.name, share),
+            shorten_to_fit(tally.name, share),
             ha="center",
             va="center",
             fontsize=7,
@@ -122,17 +129,17 @@ def _draw_stacked_bar(
     )
 
 
-def fitting(name: str, share: float) -> str:
+def shorten_to_fit(name: str, fraction: float) -> str:
     """Shorten a prediction's name to what fits into its bar.
 
     That is the full name, the first of several names, the beginning of it, or nothing.
     """
-    room = int(share * LETTERS)
+    room = int(fraction * MAX_LETTERS)
     first_name = name.partition(",")[0]
     for text in (name, first_name):
         if len(text) <= room:
             return text
-    if room > FEWEST_LETTERS:
+    if room > MIN_LETTERS:
         return f"{first_name[: room - 1].rstrip()}…"
     return ""
 
@@ -143,7 +150,7 @@ def fitting(name: str, share: float) -> str:
 SEED = 0
 RESAMPLES = 2000
 # pairs of object and texture: two of each
-FEWEST_PAIRS = 4
+MIN_PAIRS = 4
 
 
 class CuesOptions(Options):
@@ -154,43 +161,50 @@ class CuesOptions(Options):
     classes: dict[str, list[str]] = Field(default_factory=dict)
 
 
-def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
+def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
     """Make a figure of how often the prediction is the object or its texture.
 
     Its sentences also say which of both cues predicts the predictions better.
     """
     names_texture = dict[str, Any]()
-    by_shape = dict[str, Tally]()
-    by_texture = dict[str, Tally]()
-    for texture, texture_rows in rates.by(rows, options.texture).items():
+    by_shape = dict[str, ClusteredFraction]()
+    by_texture = dict[str, ClusteredFraction]()
+    for texture, texture_rows in rates.split_rows(rows, options.texture).items():
         classes = options.classes.get(texture, ())
-        names_texture[texture] = _names_class(texture_rows[rates.PREDICTION], classes)
-        by_shape[texture] = Tally.over(texture, texture_rows)
-        by_texture[texture] = Tally.over(texture, texture_rows, names_texture[texture])
+        names_texture[texture] = _names_class(
+            texture_rows[rates.PREDICTION_COLUMN], classes
+        )
+        by_shape[texture] = ClusteredFraction.from_rows(texture, texture_rows)
+        by_texture[texture] = ClusteredFraction.from_rows(
+            texture, texture_rows, names_texture[texture]
+        )
 
     text = [
         "The prediction is the object, whatever its texture: "
-        f"{Tally.over('', rows).told('so')}."
+        f"{ClusteredFraction.from_rows('', rows).describe('so')}."
     ]
     with_classes = [name for name in names_texture if options.classes.get(name)]
     if with_classes:
         flags = pd.concat([names_texture[name] for name in with_classes])
-        total = Tally.over("", rows.loc[flags.index], flags)
+        total = ClusteredFraction.from_rows("", rows.loc[flags.index], flags)
         text.append(
             f"The prediction names the texture ({', '.join(with_classes)}): "
-            f"{total.told('so')}."
+            f"{total.describe('so')}."
         )
-        if not total.share:
+        if not total.fraction:
             text.append("A model that has no class for a texture cannot name it.")
-    text.append(_compare_cues(predicted(rows, options)))
-    text += rates.extremes(
+    text.append(_compare_cues(count_predicted(rows, options)))
+    text += rates.describe_extremes(
         list(by_shape.values()), "The hardest texture", "the easiest", "textures"
     )
-    return MadeFigure(
+    return FigureContent(
         "Predictions by shape and by texture",
         text,
-        [options.texture, "the object", *rates.COUNT, "the texture"],
-        [[name, *by_shape[name].cells, by_texture[name].times] for name in by_shape],
+        [options.texture, "the object", *rates.FRACTION_HEADS, "the texture"],
+        [
+            [name, *by_shape[name].table_cells, by_texture[name].n_counted]
+            for name in by_shape
+        ],
         lambda figure: _draw_cues(figure, by_shape, by_texture),
         (6.0, 1.7 + 0.27 * len(by_shape)),
     )
@@ -205,13 +219,15 @@ def _names_class(predictions: Any, classes: Sequence[str]) -> Any:
 
 
 def _draw_cues(
-    figure: Any, by_shape: Mapping[str, Tally], by_texture: Mapping[str, Tally]
+    figure: Any,
+    by_shape: Mapping[str, ClusteredFraction],
+    by_texture: Mapping[str, ClusteredFraction],
 ) -> None:
     """Draw for each texture the fractions of predictions by shape and by texture."""
     axes = figure.subplots()
-    ordered = sorted(by_shape, key=lambda name: by_shape[name].share or 0.0)
-    shape_shares = [by_shape[name].share or 0.0 for name in ordered]
-    texture_shares = [by_texture[name].share or 0.0 for name in ordered]
+    ordered = sorted(by_shape, key=lambda name: by_shape[name].fraction or 0.0)
+    shape_shares = [by_shape[name].fraction or 0.0 for name in ordered]
+    texture_shares = [by_texture[name].fraction or 0.0 for name in ordered]
     style = {"alpha": 0.55, "height": 0.66}
     axes.barh(ordered, shape_shares, color=figures.BLUE, label="the object", **style)
     axes.barh(
@@ -237,7 +253,7 @@ def _draw_cues(
     figure.legend(loc="outside lower center", ncols=2, title="the prediction names")
 
 
-def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
+def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
     """Count how many predictions the shape and the texture predict, by pair of both.
 
     A cue predicts the most frequent of the predictions about the same object with
@@ -251,11 +267,14 @@ def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
     """
     generator = random.Random(SEED)
     groups = rows.groupby(
-        [rates.column(rows, options.shape), rates.column(rows, options.texture)],
+        [
+            rates.get_column(rows, options.shape),
+            rates.get_column(rows, options.texture),
+        ],
         sort=False,
     )
     labels_of_pair = {
-        pair: list(pair_rows[rates.PREDICTION]) for pair, pair_rows in groups
+        pair: list(pair_rows[rates.PREDICTION_COLUMN]) for pair, pair_rows in groups
     }
     counts = list[tuple[int, int, int]]()
     for (shape, texture), labels in labels_of_pair.items():
@@ -279,20 +298,20 @@ def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
 def _most_frequent_of_sample(
     labels: Sequence[str], n_samples: int, generator: random.Random
 ) -> str:
-    return rates.most_frequent(generator.sample(labels, n_samples))[0][0]
+    return rates.rank_predictions(generator.sample(labels, n_samples))[0][0]
 
 
 def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
     """Describe by how many percentage points the shape predicts better.
 
     Predictions about one pair of object and texture are dependent: the interval is a
-    percentile bootstrap over pairs. `pairs` are counts as `predicted` returns them.
+    percentile bootstrap over pairs. `pairs` are counts as `count_predicted` returns them.
     """
-    if len(pairs) < FEWEST_PAIRS:
+    if len(pairs) < MIN_PAIRS:
         return (
             "Whether the predictions go more by shape or by texture is not said: that "
             "takes at least two objects and "
-            f"two textures, {FEWEST_PAIRS} pairs in all."
+            f"two textures, {MIN_PAIRS} pairs in all."
         )
     generator = random.Random(SEED)
     resampled = sorted(
@@ -327,11 +346,11 @@ def _shape_advantage(pairs: Sequence[tuple[int, int, int]]) -> float:
 
 # ---- mixtures
 
-Doubles = npt.NDArray[np.float64]
-Shares = tuple[float, float, float]
+Float64Array = npt.NDArray[np.float64]
+Mixture = tuple[float, float, float]
 # indices along the first and the second share, and whether it points down
 Triangle = tuple[int, int, bool]
-MEANINGLESS = (
+SINGLE_PREDICTION = (
     "The prediction is {} in every picture, so that shares of predictions tell "
     "nothing. Colours are how far the right "
     "prediction leads the best wrong one: the margin, in logits for a classifier."
@@ -352,19 +371,21 @@ class TernaryOptions(Options):
     side: int = Field(default=5, ge=1, le=20)
 
 
-def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
+def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     """Make a figure of where in a mixture each prediction is frequent.
 
     If all predictions are the same, it shows the margin of the right label instead.
     """
     mixtures = _read_mixtures(rows, options)
-    names = [rates.bare(name) for name in options.shares]
+    names = [rates.strip_control(name) for name in options.shares]
     main_ingredient = mixtures.argmax(axis=1)  # (n,)
-    corners = all_triangles(options.side)
-    triangles = pd.Series([triangle_of(mixture, options.side) for mixture in mixtures])
+    corners = list_triangles(options.side)
+    triangles = pd.Series(
+        [find_triangle(mixture, options.side) for mixture in mixtures]
+    )
     in_triangle = [(triangles == triangle).to_numpy() for triangle in corners]
 
-    ranking = rates.most_frequent(rows[rates.PREDICTION])
+    ranking = rates.rank_predictions(rows[rates.PREDICTION_COLUMN])
     margins = _margins_by_ingredient(rows, names, main_ingredient)
     by_margin = len(ranking) == 1 and min(map(len, margins.values())) >= 2
     ranking = ranking[: options.most]
@@ -376,7 +397,7 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
         )
     panels = dict[str, list[float | None]]()
     for label, _ in ranking:
-        values = (rows[rates.PREDICTION] == label).to_numpy()
+        values = (rows[rates.PREDICTION_COLUMN] == label).to_numpy()
         if by_margin:
             values = rows["margin"].astype(float).to_numpy()
         panels[label] = _mean_by_triangle(values, in_triangle)
@@ -392,19 +413,21 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
 
     size = (max(2.4 * len(panels), 4.8), 3.5)
     title = f"Predictions over {', '.join(names)}"
-    return MadeFigure(title, text, heads, table, draw, size)
+    return FigureContent(title, text, heads, table, draw, size)
 
 
-def _read_mixtures(rows: Rows, options: TernaryOptions) -> Doubles:
+def _read_mixtures(rows: Rows, options: TernaryOptions) -> Float64Array:
     """Return the amounts of three ingredients (n, 3), divided by their sum."""
-    amounts = np.stack([rates.numbers(rows, name) for name in options.shares], axis=1)
+    amounts = np.stack(
+        [rates.get_numeric_column(rows, name) for name in options.shares], axis=1
+    )
     total = amounts.sum(axis=1, keepdims=True)
     return amounts / np.where(total == 0.0, 1.0, total)
 
 
 def _margins_by_ingredient(
     rows: Rows, names: Sequence[str], main_ingredient: npt.NDArray[np.intp]
-) -> dict[str, Doubles]:
+) -> dict[str, Float64Array]:
     """Return the known margins of the mixtures in which each ingredient is largest."""
     margin = rows["margin"].astype(float).to_numpy()
     is_known = ~np.isnan(margin)
@@ -426,10 +449,10 @@ def _mean_by_triangle(
 
 
 def _describe_margins(
-    label: str, margins: Mapping[str, Doubles]
+    label: str, margins: Mapping[str, Float64Array]
 ) -> tuple[list[str], list[str], list[list[rates.Cell]]]:
     """Describe the margins by main ingredient: sentences, heads and rows of a table."""
-    text = [MEANINGLESS.format(label), _compare_margins(margins)]
+    text = [SINGLE_PREDICTION.format(label), _compare_margins(margins)]
     heads = [
         "where most is",
         "pictures",
@@ -452,15 +475,17 @@ def _describe_ingredients(
     """Describe predictions by main ingredient: sentences, heads and rows of a table."""
     text = list[str]()
     table = list[list[rates.Cell]]()
-    heads = ["prediction", "where most is", "given in", *rates.COUNT]
+    heads = ["prediction", "where most is", "given in", *rates.FRACTION_HEADS]
     for label, times in ranking:
-        is_label = (rows[rates.PREDICTION] == label).to_numpy()
+        is_label = (rows[rates.PREDICTION_COLUMN] == label).to_numpy()
         tallies = []
         for index, name in enumerate(names):
             is_main = main_ingredient == index
-            tallies.append(Tally.over(name, rows[is_main], is_label[is_main]))
+            tallies.append(
+                ClusteredFraction.from_rows(name, rows[is_main], is_label[is_main])
+            )
         whose = f"{label}, {wording.percent(times / len(rows))} of all predictions, is"
-        if len({tally.share for tally in tallies if tally.total}) == 1:
+        if len({tally.fraction for tally in tallies if tally.total}) == 1:
             text.append(
                 f"{whose} given as often whatever most of the mixture is: no "
                 "difference is shown."
@@ -468,17 +493,17 @@ def _describe_ingredients(
         else:
             rarest = f"{whose} rarest where most of the mixture"
             most_frequent = "most frequent where most of it"
-            text += rates.extremes(
+            text += rates.describe_extremes(
                 tallies, rarest, most_frequent, "ingredients", "given"
             )
-        table += [[label, tally.name, *tally.cells] for tally in tallies]
+        table += [[label, tally.name, *tally.table_cells] for tally in tallies]
     return text, heads, table
 
 
 def _draw_panels(
     figure: Any,
     panels: Mapping[str, Sequence[float | None]],
-    corners: Sequence[Sequence[Shares]],
+    corners: Sequence[Sequence[Mixture]],
     names: Sequence[str],
     by_margin: bool,
     options: TernaryOptions,
@@ -510,7 +535,7 @@ def _draw_panels(
         )
 
 
-def triangle_of(mixture: Sequence[float], side: int) -> Triangle:
+def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
     """Return the triangle of a ternary diagram that three fractions (3,) lie in.
 
     `side` is the number of triangles along a side.
@@ -526,10 +551,10 @@ def triangle_of(mixture: Sequence[float], side: int) -> Triangle:
     return a, b, a + b + c < side - 1
 
 
-def all_triangles(side: int) -> dict[Triangle, tuple[Shares, Shares, Shares]]:
+def list_triangles(side: int) -> dict[Triangle, tuple[Mixture, Mixture, Mixture]]:
     """Return the triangles of a ternary diagram with the fractions at their corners."""
 
-    def mixture_at(x: int, y: int) -> Shares:
+    def mixture_at(x: int, y: int) -> Mixture:
         return x / side, y / side, (side - x - y) / side
 
     corners = {}
@@ -546,7 +571,7 @@ def all_triangles(side: int) -> dict[Triangle, tuple[Shares, Shares, Shares]]:
     return corners
 
 
-def _compare_margins(margins: Mapping[str, Doubles]) -> str:
+def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     """Compare the smallest and the largest mean margin by normal intervals.
 
     For the comparison they are widened for a choice among all (Bonferroni).
@@ -572,7 +597,7 @@ def _compare_margins(margins: Mapping[str, Doubles]) -> str:
     )
 
 
-def _mean_interval(values: Doubles, n_compared: int = 1) -> tuple[float, float]:
+def _mean_interval(values: Float64Array, n_compared: int = 1) -> tuple[float, float]:
     """Return the normal interval of a mean, widened for a choice among `n_compared`."""
     alpha = (1.0 - statistics.intervals.CONFIDENCE) / (2.0 * n_compared)
     half_width = NormalDist().inv_cdf(1.0 - alpha) * _standard_error(values)
@@ -580,7 +605,7 @@ def _mean_interval(values: Doubles, n_compared: int = 1) -> tuple[float, float]:
     return mean - half_width, mean + half_width
 
 
-def _standard_error(values: Doubles) -> float:
+def _standard_error(values: Float64Array) -> float:
     """Compute the standard error of the mean of values (n,)."""
     return float(values.std(ddof=1)) / math.sqrt(len(values))
 
@@ -589,7 +614,7 @@ def _draw_panel(
     axes: Any,
     label: str,
     values: Sequence[float | None],
-    corners: Sequence[Sequence[Shares]],
+    corners: Sequence[Sequence[Mixture]],
     names: Sequence[str],
 ) -> Any:
     """Draw a ternary diagram, and return its colored triangles for a color bar.
@@ -640,6 +665,6 @@ def _draw_panel(
     return triangles
 
 
-def _to_plane(mixture: Shares) -> tuple[float, float]:
+def _to_plane(mixture: Mixture) -> tuple[float, float]:
     """Convert three fractions to a point in the unit-sided triangle."""
     return mixture[1] + mixture[2] / 2.0, mixture[2] * math.sqrt(3.0) / 2.0

@@ -30,12 +30,12 @@ from advsearch.questions.recipe.description import PHOTOGRAPHS
 
 # ---- The rows of a recipe's runs as one frame, and what all figures share
 
-PREDICTION = "answer"
-GROUP = "group"
-PART = "part"
-TRIAL = "trial"
-MODEL = "model"
-WORKERS = "workers"
+PREDICTION_COLUMN = "answer"
+GROUP_COLUMN = "group"
+PART_COLUMN = "part"
+TRIAL_COLUMN = "trial"
+MODEL_COLUMN = "model"
+WORKERS_COLUMN = "workers"
 """Columns other than parameters.
 
 They hold the model's prediction, the group of the object, the part of the recipe, the
@@ -43,16 +43,16 @@ kind of trial (of an attack), the model, and the number of worker processes (of 
 that set it).
 """
 
-OTHERS = "other objects"
+OTHER_OBJECTS = "other objects"
 
-TRIALS = {"first control": "clean scene", "control": "clean scene", "verification": "answer",
+TRIAL_NAMES = {"first control": "clean scene", "control": "clean scene", "verification": "answer",
           "baseline verification": "random search"}  # fmt: skip
 """The kinds of an attack's rows that are in the frame, and their names in figures."""
 
 # columns of a table for one proportion, after the column of its numerator
-COUNT = ["of", "share", "low", "high"]
+FRACTION_HEADS = ["of", "share", "low", "high"]
 Cell = str | int | float | None
-Numbers = npt.NDArray[np.float64]
+Float64Array = npt.NDArray[np.float64]
 # a pd.DataFrame, which has no types
 Rows = Any
 
@@ -94,19 +94,21 @@ def read_rows(
             if row.kind == "sweep" and draws is not None:
                 unit = f"{seed} {draws.of(row.step)}"
             if summary.command == "attack":
-                values[TRIAL] = TRIALS[row.kind]
+                values[TRIAL_COLUMN] = TRIAL_NAMES[row.kind]
                 unit = f"{seed} {row.step}"
-            for name in ("object", "environment", MODEL):
+            for name in ("object", "environment", MODEL_COLUMN):
                 value = values.get(name, getattr(summary, name))
                 values[name] = wording.figure_value(str(value))
-            values[PREDICTION] = row.label or "none"
+            values[PREDICTION_COLUMN] = row.label or "none"
             values["correct"] = bool(row.correct)
             values["margin"] = row.margin
-            rows.append({**values, "time": row.time, PART: part, "unit": unit, **more})
+            rows.append(
+                {**values, "time": row.time, PART_COLUMN: part, "unit": unit, **more}
+            )
     return rows, units
 
 
-def frame_of(
+def make_frame(
     rows: Iterable[Mapping[str, Any]], groups: Mapping[str, Sequence[str]], **facts: Any
 ) -> Rows:
     """Make a frame of rows, with a column for the group of each object.
@@ -123,12 +125,14 @@ def frame_of(
         for group, objects in groups.items():
             for name in objects:
                 group_of_object.setdefault(name, group)
-        frame[GROUP] = [group_of_object.get(name, OTHERS) for name in frame["object"]]
+        frame[GROUP_COLUMN] = [
+            group_of_object.get(name, OTHER_OBJECTS) for name in frame["object"]
+        ]
     frame.attrs = facts
     return frame
 
 
-def column(rows: Rows, name: str) -> Any:
+def get_column(rows: Rows, name: str) -> Any:
     """Return a column that has a value in each row.
 
     Raises:
@@ -141,20 +145,20 @@ def column(rows: Rows, name: str) -> Any:
     return rows[name]
 
 
-def numbers(rows: Rows, name: str) -> Any:
+def get_numeric_column(rows: Rows, name: str) -> Any:
     """Return a column of numbers.
 
     Raises:
         InputError: if the column lacks values or holds names.
     """
-    if not pd.api.types.is_numeric_dtype(column(rows, name)):
+    if not pd.api.types.is_numeric_dtype(get_column(rows, name)):
         raise InputError(
             f"figures: {name}: expected a parameter with numbers, got names"
         )
     return rows[name]
 
 
-def unit_of(rows: Rows, name: str) -> str:
+def format_unit(rows: Rows, name: str) -> str:
     """Format the unit of a column to follow a number: " m", or "" if it has none."""
     unit = rows.attrs["units"].get(name, "")
     if unit in ("", "1", "name"):
@@ -162,99 +166,107 @@ def unit_of(rows: Rows, name: str) -> str:
     return f" {unit}"
 
 
-def by(rows: Rows, name: str) -> dict[str, Rows]:
+def split_rows(rows: Rows, name: str) -> dict[str, Rows]:
     """Split rows by their value in a column.
 
     Numbers are in ascending order, names in the order of their first row.
     """
-    is_numeric = pd.api.types.is_numeric_dtype(column(rows, name))
+    is_numeric = pd.api.types.is_numeric_dtype(get_column(rows, name))
     return {
         wording.figure_value(value): group_rows
         for value, group_rows in rows.groupby(name, sort=is_numeric)
     }
 
 
-def most_frequent(predictions: Iterable[str]) -> list[tuple[str, int]]:
+def rank_predictions(predictions: Iterable[str]) -> list[tuple[str, int]]:
     """Count predictions, the most frequent first; ties are in alphabetical order."""
     return sorted(Counter(predictions).items(), key=lambda item: (-item[1], item[0]))
 
 
-class Tally:
+class ClusteredFraction:
     """Count rows of independent units, and estimate the fraction that is counted.
 
     A unit is what rows share that are not independent, such as a draw of a seed.
-    `counted` (n,) of its `of` (n,) rows are counted in each unit; in all, `times` of
-    `total`. `share` is the mean over units of their fraction, None without rows.
+    `unit_counts` (n,) of its `unit_sizes` (n,) rows are counted in each unit; in all, `n_counted` of
+    `total`. `fraction` is the mean over units of their fraction, None without rows.
     """
 
-    def __init__(self, name: str, counted: Numbers, of: Numbers) -> None:
+    def __init__(
+        self, name: str, unit_counts: Float64Array, unit_sizes: Float64Array
+    ) -> None:
         self.name = name
-        self.counted = counted
-        self.of = of
-        self.times = round(float(counted.sum()))
-        self.total = round(float(of.sum()))
-        self.share = None
+        self.unit_counts = unit_counts
+        self.unit_sizes = unit_sizes
+        self.n_counted = round(float(unit_counts.sum()))
+        self.total = round(float(unit_sizes.sum()))
+        self.fraction = None
         if self.total:
-            self.share = statistics.clustered.mean_share(counted, of)
+            self.fraction = statistics.clustered.mean_rate(unit_counts, unit_sizes)
 
     @classmethod
-    def over(cls, name: str, rows: Rows, flags: Any = None) -> Tally:
+    def from_rows(cls, name: str, rows: Rows, flags: Any = None) -> ClusteredFraction:
         """Count rows by unit: those that are flagged (n,), by default the correct ones."""
         if flags is None:
             flags = rows["correct"]
         is_counted = np.asarray(flags, dtype=np.float64)
         unit_index = pd.factorize(rows["unit"])[0]
-        unit_counts = statistics.clustered.per_unit(is_counted, unit_index)
-        unit_sizes = statistics.clustered.per_unit(np.ones(len(rows)), unit_index)
+        unit_counts = statistics.clustered.sum_per_unit(is_counted, unit_index)
+        unit_sizes = statistics.clustered.sum_per_unit(np.ones(len(rows)), unit_index)
         return cls(name, unit_counts, unit_sizes)
 
-    def called(self, name: str) -> Tally:
+    def with_name(self, name: str) -> ClusteredFraction:
         """Return the same counts under another name."""
-        return Tally(name, self.counted, self.of)
+        return ClusteredFraction(name, self.unit_counts, self.unit_sizes)
 
     @property
-    def cells(self) -> list[Cell]:
+    def table_cells(self) -> list[Cell]:
         """Cells of a table: numerator, denominator, fraction, and its 95 % interval."""
         bounds = self.interval() or (None, None)
-        return [self.times, self.total, self.share, *bounds]
+        return [self.n_counted, self.total, self.fraction, *bounds]
 
     @property
-    def drawn(self) -> tuple[float, results.Interval] | None:
+    def fraction_with_interval(self) -> tuple[float, results.Interval] | None:
         """The fraction with its 95 % interval, as a bar chart takes it."""
-        if self.share is None:
+        if self.fraction is None:
             return None
-        return self.share, self.interval() or (0.0, 1.0)
+        return self.fraction, self.interval() or (0.0, 1.0)
 
-    def interval(self, among: int = 1) -> results.Interval | None:
+    def interval(self, n_compared: int = 1) -> results.Interval | None:
         """Return the 95 % interval of the fraction.
 
-        With `among` > 1 it is widened for a choice among as many (Bonferroni).
+        With `n_compared` > 1 it is widened for a choice among as many (Bonferroni).
         """
         if not self.total:
             return None
-        confidence = 1.0 - (1.0 - statistics.intervals.CONFIDENCE) / max(among, 1)
-        return statistics.clustered.share_interval(self.counted, self.of, confidence)
+        confidence = 1.0 - (1.0 - statistics.intervals.CONFIDENCE) / max(n_compared, 1)
+        return statistics.clustered.rate_interval(
+            self.unit_counts, self.unit_sizes, confidence
+        )
 
-    def told(self, verb: str = "right") -> str:
+    def describe(self, verb: str = "right") -> str:
         """Format the fraction: ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``.
 
         `verb` is what is counted.
         """
         share = (
-            f"{wording.percent(self.share)}, 95 % interval "
+            f"{wording.percent(self.fraction)}, 95 % interval "
             f"{wording.interval_text(self.interval())}"
         )
-        return f"{verb} in {self.times} of {self.total} ({share})"
+        return f"{verb} in {self.n_counted} of {self.total} ({share})"
 
-    def below(self, other: Tally, among: int = 1) -> bool:
+    def is_below(self, other: ClusteredFraction, n_compared: int = 1) -> bool:
         """Return whether this interval lies below that of another tally, both widened."""
-        lower = self.interval(among)
-        upper = other.interval(among)
+        lower = self.interval(n_compared)
+        upper = other.interval(n_compared)
         return lower is not None and upper is not None and lower[1] < upper[0]
 
 
-def extremes(
-    counts: Sequence[Tally], worst: str, best: str, thing: str, verb: str = "right"
+def describe_extremes(
+    fractions: Sequence[ClusteredFraction],
+    lowest_prefix: str,
+    highest_prefix: str,
+    things: str,
+    verb: str = "right",
 ) -> list[str]:
     """Describe which tally has the lowest fraction and which has the highest.
 
@@ -263,47 +275,50 @@ def extremes(
     overlap, no difference is shown.
 
     Args:
-        counts: the tallies; those without rows are left out.
-        worst: beginning of the sentence about the lowest, such as "Lowest".
-        best: beginning of the part about the highest.
-        thing: plural of what the tallies are of.
+        fractions: the tallies; those without rows are left out.
+        lowest_prefix: beginning of the sentence about the lowest, such as "Lowest".
+        highest_prefix: beginning of the part about the highest.
+        things: plural of what the tallies are of.
         verb: what is counted.
     """
-    known = [tally for tally in counts if tally.total]
+    known = [tally for tally in fractions if tally.total]
     if len(known) < 2:
-        return [f"{tally.name}: {tally.told(verb)}." for tally in known]
-    shares = [tally.share or 0.0 for tally in known]
+        return [f"{tally.name}: {tally.describe(verb)}." for tally in known]
+    shares = [tally.fraction or 0.0 for tally in known]
     lowest = known[int(np.argmin(shares))]
     highest = known[int(np.argmax(shares))]
-    if lowest.share == highest.share:
+    if lowest.fraction == highest.fraction:
         return [
-            f"All {len(known)} {thing} have the same share, "
-            f"{wording.percent(lowest.share)}: no difference is shown."
+            f"All {len(known)} {things} have the same share, "
+            f"{wording.percent(lowest.fraction)}: no difference is shown."
         ]
 
     descriptions = []
     for tally in (lowest, highest):
-        n_ties = shares.count(tally.share or 0.0) - 1
+        n_ties = shares.count(tally.fraction or 0.0) - 1
         ties = ""
         if n_ties:
             plural_ending = "s" if n_ties > 1 else ""
             ties = f" (as {n_ties} other{plural_ending})"
-        descriptions.append(f"is {tally.name}{ties}: {tally.told(verb)}")
+        descriptions.append(f"is {tally.name}{ties}: {tally.describe(verb)}")
     widened = (
         f"the intervals of the two, widened for having been chosen among {len(known)},"
     )
-    verdict = f"No difference between the {thing} is shown: {widened} overlap."
-    if lowest.below(highest, len(known)):
+    verdict = f"No difference between the {things} is shown: {widened} overlap."
+    if lowest.is_below(highest, len(known)):
         verdict = f"The difference is shown: {widened} do not overlap."
-    return [f"{worst} {descriptions[0]}; {best} {descriptions[1]}.", verdict]
+    return [
+        f"{lowest_prefix} {descriptions[0]}; {highest_prefix} {descriptions[1]}.",
+        verdict,
+    ]
 
 
-def plural(name: str) -> str:
+def pluralize_column(name: str) -> str:
     """Return the plural that names the values of a column.
 
     Examples are ``environments``, ``materials`` and ``values of pose.yaw``.
     """
-    if name == TRIAL:
+    if name == TRIAL_COLUMN:
         return "kinds of trials"
     control, _, parameter = name.partition(".")
     if parameter in ("", "which"):
@@ -311,7 +326,7 @@ def plural(name: str) -> str:
     return f"values of {name}"
 
 
-def bare(name: str) -> str:
+def strip_control(name: str) -> str:
     """Return a parameter's name without its control: ``milk`` for ``contents.milk``."""
     return name.rpartition(".")[2]
 
@@ -328,13 +343,13 @@ class Options(BaseModel):
     of: tuple[str, ...] = ()
 
     @property
-    def parts(self) -> tuple[str, ...]:
+    def required_parts(self) -> tuple[str, ...]:
         """The parts of the recipe whose rows the figure needs; empty for all."""
         return self.of
 
 
 @dataclass(frozen=True)
-class MadeFigure:
+class FigureContent:
     """Content of a figure: sentences, a table, and what draws all but the title.
 
     `draw` takes a matplotlib figure; `size` is in inches.
@@ -349,11 +364,11 @@ class MadeFigure:
 
 
 # default bins of a range that lines are drawn over
-BINS = 12
+DEFAULT_BINS = 12
 # characters of a label that fit under a column without being rotated
-FITTING = 4
+MAX_UPRIGHT_LETTERS = 4
 # counts by the name of a row, one for each series
-Cells = Mapping[str, Sequence[Tally]]
+Cells = Mapping[str, Sequence[ClusteredFraction]]
 
 
 class RatesOptions(Options):
@@ -371,35 +386,35 @@ class RatesOptions(Options):
     turn: float | None = Field(default=None, gt=0.0)
 
     @property
-    def parts(self) -> tuple[str, ...]:
+    def required_parts(self) -> tuple[str, ...]:
         """The parts of the recipe whose rows the figure needs; empty for all."""
         if self.beside and self.of:
             return (*self.of, self.beside)
         return self.of
 
     @property
-    def what(self) -> str:
+    def axis_label(self) -> str:
         """The label of the axis: the column, or the distance from a value of it."""
         if self.away_from is None:
             return self.by
         return f"the distance of {self.by} from {wording.figure_value(self.away_from)}"
 
 
-def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
+def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
     """Make a figure of the fractions of right or wrong predictions.
 
     Raises:
         InputError: if there are no rows, or the columns don't suit the options.
     """
     verb = "wrong" if options.wrong else "right"
-    baseline_rows = rows[rows[PART] == options.beside]
-    rows = rows[rows[PART] != options.beside]
+    baseline_rows = rows[rows[PART_COLUMN] == options.beside]
+    rows = rows[rows[PART_COLUMN] != options.beside]
     if rows.empty:
         raise InputError(
             "figures: rates: expected rows of a part beside "
             f"{options.beside!r}, got none"
         )
-    series_values = list(by(rows, options.series)) if options.series else [""]
+    series_values = list(split_rows(rows, options.series)) if options.series else [""]
     series = [options.names.get(value, value) for value in series_values]
     cells, bin_centers = _count_cells(rows, series_values, options)
     totals = _count_series("all", rows, series_values, options)
@@ -417,16 +432,16 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
     def draw(figure: Any) -> None:
         if options.form == "lines":
             positions = bin_centers or range(len(cells))
-            unit = unit_of(rows, options.by).strip()
+            unit = format_unit(rows, options.by).strip()
             _draw_rate_lines(figure, cells, series, positions, unit, options)
         else:
             _draw_rates(figure, bars, cells, series, options)
 
     series_column = [options.series] if options.series else []
-    return MadeFigure(
+    return FigureContent(
         f"{'Error' if options.wrong else 'Accuracy'} by {_split_columns(options)}",
         text,
-        [options.by, *series_column, verb, *COUNT],
+        [options.by, *series_column, verb, *FRACTION_HEADS],
         _tabulate_rates(bars, totals, series, options),
         draw,
         _choose_size(len(bars), len(cells), len(series), options),
@@ -435,50 +450,50 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
 
 def _split_columns(options: RatesOptions) -> str:
     """Name the columns that rates are split by: ``environments and models``."""
-    columns = plural(options.by)
+    columns = pluralize_column(options.by)
     if options.series:
-        columns += f" and {plural(options.series)}"
+        columns += f" and {pluralize_column(options.series)}"
     return columns
 
 
 def _count_cells(
     rows: Rows, series_values: Sequence[str], options: RatesOptions
-) -> tuple[dict[str, list[Tally]], list[float] | None]:
+) -> tuple[dict[str, list[ClusteredFraction]], list[float] | None]:
     """Count the rows of each group and series; also return the centers of bins.
 
     Bars of names are sorted by the fraction of the first series, the highest first.
     """
     groups, bin_centers = _group_rows(rows, options)
-    cells = dict[str, list[Tally]]()
+    cells = dict[str, list[ClusteredFraction]]()
     for value, group_rows in groups.items():
         name = options.names.get(value, value)
         cells[name] = _count_series(name, group_rows, series_values, options)
     is_binned = bin_centers is not None
-    is_numeric = is_numeric_dtype(column(rows, options.by))
+    is_numeric = is_numeric_dtype(get_column(rows, options.by))
     if options.form == "bars" and not is_binned and not is_numeric:
-        order = sorted(cells, key=lambda name: -(cells[name][0].share or 0.0))
+        order = sorted(cells, key=lambda name: -(cells[name][0].fraction or 0.0))
         cells = {name: cells[name] for name in order}
     return cells, bin_centers
 
 
 def _count_series(
     name: str, rows: Rows, series_values: Sequence[str], options: RatesOptions
-) -> list[Tally]:
+) -> list[ClusteredFraction]:
     """Count right or wrong predictions in each series, in the order of the series."""
     rows_of_series = {"": rows}
     if options.series and len(rows):
-        rows_of_series = by(rows, options.series)
+        rows_of_series = split_rows(rows, options.series)
     tallies = []
     for value in series_values:
         series_rows = rows_of_series.get(value, rows[:0])
         is_counted = series_rows["correct"] != options.wrong
-        tallies.append(Tally.over(name, series_rows, is_counted))
+        tallies.append(ClusteredFraction.from_rows(name, series_rows, is_counted))
     return tallies
 
 
 def _name_series(series: Sequence[str], options: RatesOptions) -> list[str]:
     """Return names of series for sentences; a number says of what: ``severity 3``."""
-    column_name = bare(options.series or "")
+    column_name = strip_control(options.series or "")
     names = []
     for name in series:
         starts_like_number = name[:1] in tuple("-0123456789")
@@ -496,23 +511,23 @@ def _describe_cells(
         for row_name, tallies in cells.items():
             names = _name_series(series, options)
             for name, tally in zip(names, tallies, strict=True):
-                pairs.append(tally.called(f"{row_name} with {name}"))
+                pairs.append(tally.with_name(f"{row_name} with {name}"))
         things = f"pairs of {_split_columns(options)}"
-        return extremes(pairs, "The lowest pair", "the highest", things, verb)
+        return describe_extremes(pairs, "The lowest pair", "the highest", things, verb)
 
     text = list[str]()
-    where = f" where {options.what}" if is_binned else ""
+    where = f" where {options.axis_label}" if is_binned else ""
     for index, name in enumerate(series):
-        tallies = [row[index].called(row_name) for row_name, row in cells.items()]
+        tallies = [row[index].with_name(row_name) for row_name, row in cells.items()]
         n_known = sum(tally.total > 0 for tally in tallies)
         if len(series) > 1 and n_known < 2:
             continue  # a single row is described by `_describe_series`
         lowest = f"For {name}, lowest" if len(series) > 1 else "Lowest"
-        text += extremes(
+        text += describe_extremes(
             tallies,
             f"{lowest}{where}",
             f"highest{where}",
-            plural(options.by),
+            pluralize_column(options.by),
             verb,
         )
     return text
@@ -520,7 +535,7 @@ def _describe_cells(
 
 def _describe_series(
     cells: Cells,
-    totals: Sequence[Tally],
+    totals: Sequence[ClusteredFraction],
     series: Sequence[str],
     options: RatesOptions,
 ) -> list[str]:
@@ -529,25 +544,25 @@ def _describe_series(
         return []
     overall = []
     for name, tally in zip(_name_series(series, options), totals, strict=True):
-        overall.append(tally.called(f"that of {name}"))
-    sentences = extremes(
+        overall.append(tally.with_name(f"that of {name}"))
+    sentences = describe_extremes(
         overall,
         "Over all, the lowest share",
         "the highest",
-        plural(options.series),
+        pluralize_column(options.series),
         "wrong" if options.wrong else "right",
     )
     # one text, so that figures by other columns do not repeat it
     text = [" ".join(sentences)]
-    if not options.wrong or options.series != MODEL:
+    if not options.wrong or options.series != MODEL_COLUMN:
         return text
     for index, name in enumerate(series[1:], start=1):
         # The mean over rows of the errors divided by those of the first model; rows
         # in which that has none are left out.
         ratios = []
         for tallies in cells.values():
-            if tallies[0].share:
-                ratios.append((tallies[index].share or 0.0) / tallies[0].share)
+            if tallies[0].fraction:
+                ratios.append((tallies[index].fraction or 0.0) / tallies[0].fraction)
         if ratios:
             mean = 100.0 * sum(ratios) / len(ratios)
             text.append(
@@ -559,27 +574,27 @@ def _describe_series(
 
 def _compare_with_baseline(
     name: str,
-    tallies: Sequence[Tally],
-    totals: Sequence[Tally],
+    tallies: Sequence[ClusteredFraction],
+    totals: Sequence[ClusteredFraction],
     series: Sequence[str],
     verb: str,
 ) -> list[str]:
     """Compare the part `name` with all other rows, a sentence for each series."""
     text = []
     for series_name, tally, total in zip(series, tallies, totals, strict=True):
-        differs = tally.below(total) or total.below(tally)
+        differs = tally.is_below(total) or total.is_below(tally)
         verdict = "is shown" if differs else "is not shown"
         whose = f"{series_name}, " if len(series) > 1 else ""
         text.append(
-            f"{whose}{name}: {tally.told(verb)}; the others: "
-            f"{total.told(verb)}. A difference {verdict}."
+            f"{whose}{name}: {tally.describe(verb)}; the others: "
+            f"{total.describe(verb)}. A difference {verdict}."
         )
     return text
 
 
 def _tabulate_rates(
     cells: Cells,
-    totals: Sequence[Tally],
+    totals: Sequence[ClusteredFraction],
     series: Sequence[str],
     options: RatesOptions,
 ) -> list[list[Cell]]:
@@ -591,7 +606,7 @@ def _tabulate_rates(
     for row_name, tallies in tallies_of_row.items():
         for series_name, tally in zip(series, tallies, strict=True):
             series_cell = [series_name] if options.series else []
-            table.append([row_name, *series_cell, *tally.cells])
+            table.append([row_name, *series_cell, *tally.table_cells])
     return table
 
 
@@ -621,7 +636,7 @@ def _draw_rates(
         axes.set(ylabel=options.by, xlabel=options.series or "")
         return
     shares = {
-        row_name: [tally.drawn for tally in tallies]
+        row_name: [tally.fraction_with_interval for tally in tallies]
         for row_name, tallies in bars.items()
     }
     figures.draw_shares(axes, shares, series)
@@ -642,7 +657,7 @@ def _draw_rate_lines(
     axes = figure.subplots()
     _draw_lines(axes, cells, series, positions)
     label = f"{'wrong' if options.wrong else 'right'}, share"
-    x_label = f"{options.what} [{unit}]" if unit else options.what
+    x_label = f"{options.axis_label} [{unit}]" if unit else options.axis_label
     axes.set(xlabel=x_label, ylabel=f"{label} with 95 % interval")
     if len(series) > 1:
         figure.legend(loc="outside lower center", ncols=min(len(series), 3))
@@ -653,9 +668,9 @@ def _group_rows(
 ) -> tuple[Mapping[str, Rows], list[float] | None]:
     """Split rows by a column's values, or by bins; also return the centers of bins."""
     if options.bins is None and options.form != "lines":
-        return by(rows, options.by), None
+        return split_rows(rows, options.by), None
     values = _read_binned_values(rows, options)
-    n_bins = options.bins or BINS
+    n_bins = options.bins or DEFAULT_BINS
     lower, upper = options.range or (values.min(), values.max())
     if not upper > lower:
         raise InputError(
@@ -670,7 +685,7 @@ def _group_rows(
     centers = list[float]()
     for index, (start, end) in enumerate(pairwise(edges)):
         bounds = f"{wording.figure_value(start)} to {wording.figure_value(end)}"
-        name = bounds + unit_of(rows, options.by)
+        name = bounds + format_unit(rows, options.by)
         groups[name] = rows[bin_index == index]
         centers.append((start + end) / 2)
     return groups, centers
@@ -678,7 +693,7 @@ def _group_rows(
 
 def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
     """Return the column that is binned, or its distances from a value."""
-    values = numbers(rows, options.by)
+    values = get_numeric_column(rows, options.by)
     if options.away_from is None:
         return values
     distance = (values - options.away_from).abs()
@@ -691,7 +706,7 @@ def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
 def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> None:
     """Draw the fractions as a matrix of colors with percentages in it."""
     shares = [
-        [math.nan if tally.share is None else tally.share for tally in tallies]
+        [math.nan if tally.fraction is None else tally.fraction for tally in tallies]
         for tallies in cells.values()
     ]
     image = axes.imshow(shares, cmap="RdBu", vmin=0.0, vmax=1.0, aspect="auto")
@@ -708,7 +723,7 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
             fontsize=7.5,
         )
     label_style = dict[str, Any]()
-    if max(map(len, series)) > FITTING:
+    if max(map(len, series)) > MAX_UPRIGHT_LETTERS:
         label_style = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
     axes.set_xticks(range(len(series)), series, **label_style)
     axes.set_yticks(range(len(cells)), list(cells))
@@ -735,7 +750,7 @@ def _draw_lines(
                 continue
             interval = tally.interval() or (0.0, 1.0)
             positions.append(position)
-            shares.append(tally.share)
+            shares.append(tally.fraction)
             lower.append(interval[0])
             upper.append(interval[1])
         color = figures.SERIES[index % len(figures.SERIES)]
@@ -758,7 +773,7 @@ NO_PHOTOGRAPHS = (
     "runs in parts/, or name a folder of them (photographs=FOLDER), and let advsearch "
     "resume go on with this run."
 )
-ALL = "all objects"
+ALL_OBJECTS = "all objects"
 
 
 class AgreementOptions(Options):
@@ -772,12 +787,12 @@ class AgreementOptions(Options):
     names: dict[str, str] = Field(default_factory=dict)
 
     @property
-    def parts(self) -> tuple[str, ...]:
+    def required_parts(self) -> tuple[str, ...]:
         """The parts of the recipe whose rows the figure needs."""
         return (*self.of, PHOTOGRAPHS)
 
 
-def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
+def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureContent:
     """Compare predictions about renderings with those about other images of the same.
 
     A pair agrees if the model is right about both or wrong about both.
@@ -785,19 +800,19 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
     Raises:
         InputError: if a part has no rows or other configurations.
     """
-    renderings = rows[rows[PART] == options.of[0]].dropna(axis=1, how="all")
+    renderings = rows[rows[PART_COLUMN] == options.of[0]].dropna(axis=1, how="all")
     if renderings.empty:
         raise InputError(
             "figures: agreement: expected predictions of a part "
             f"{options.of[0]!r}, got none"
         )
-    objects = [ALL, *renderings["object"].unique()]
-    bars: dict[str, list[Tally]] = {name: [] for name in objects}
+    objects = [ALL_OBJECTS, *renderings["object"].unique()]
+    bars: dict[str, list[ClusteredFraction]] = {name: [] for name in objects}
     text = list[str]()
     table = list[list[Cell]]()
     series = list[str]()
     for part in (PHOTOGRAPHS, *options.of[1:]):
-        part_rows = rows[rows[PART] == part]
+        part_rows = rows[rows[PART_COLUMN] == part]
         if part == PHOTOGRAPHS and part_rows.empty:
             text.append(NO_PHOTOGRAPHS)
             continue
@@ -811,20 +826,29 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
         series_name = options.names.get(part, part)
         series.append(series_name)
         for name, tallies in bars.items():
-            object_pairs = pairs if name == ALL else pairs[pairs["object"] == name]
+            object_pairs = (
+                pairs if name == ALL_OBJECTS else pairs[pairs["object"] == name]
+            )
             tally, cells = _count_agreement(name, object_pairs)
             tallies.append(tally)
             table.append([series_name, name, *cells])
         if len(pairs):
-            text.append(_describe_agreement(series_name, bars[ALL][-1], pairs))
+            text.append(_describe_agreement(series_name, bars[ALL_OBJECTS][-1], pairs))
         if part == PHOTOGRAPHS:
             text += _describe_photographs(len(pairs), n_unpaired)
 
     four_heads = ["right, right", "right, wrong", "wrong, right", "wrong, wrong"]
-    return MadeFigure(
+    return FigureContent(
         "Renderings and other pictures of the same",
         text,
-        ["rendering and", "object", *four_heads, "same prediction", "agree", *COUNT],
+        [
+            "rendering and",
+            "object",
+            *four_heads,
+            "same prediction",
+            "agree",
+            *FRACTION_HEADS,
+        ],
         table,
         lambda figure: _draw_agreement(figure, bars, series),
         (6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),
@@ -835,7 +859,8 @@ def _draw_agreement(figure: Any, bars: Cells, series: Sequence[str]) -> None:
     """Draw bars of the fraction of pairs that agree, for all and for each object."""
     axes = figure.subplots()
     shares = {
-        name: [tally.drawn for tally in tallies] for name, tallies in bars.items()
+        name: [tally.fraction_with_interval for tally in tallies]
+        for name, tallies in bars.items()
     }
     figures.draw_shares(axes, shares, series)
     axes.set(xlabel="share that agrees, with 95 % interval")
@@ -848,12 +873,12 @@ def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
     A row may have more parameters than its rendering. Columns of the rendering that
     the row has too end in `` rendered``.
     """
-    per_row = {PREDICTION, PART, "correct", "margin", "time", "unit"}
+    per_row = {PREDICTION_COLUMN, PART_COLUMN, "correct", "margin", "time", "unit"}
     configuration = [name for name in renderings if name not in per_row]
     return part_rows.merge(renderings, on=configuration, suffixes=("", " rendered"))
 
 
-def _count_agreement(name: str, pairs: Rows) -> tuple[Tally, list[Cell]]:
+def _count_agreement(name: str, pairs: Rows) -> tuple[ClusteredFraction, list[Cell]]:
     """Count the pairs that agree; also return the cells of the table's row."""
     of_rendering = pairs["correct rendered"]
     of_other = pairs["correct"]
@@ -864,20 +889,22 @@ def _count_agreement(name: str, pairs: Rows) -> tuple[Tally, list[Cell]]:
                 of_other == other_is_right
             )
             confusion.append(int(is_counted.sum()))
-    tally = Tally.over(name, pairs, of_rendering == of_other)
-    return tally, [*confusion, _count_same_prediction(pairs), *tally.cells]
+    tally = ClusteredFraction.from_rows(name, pairs, of_rendering == of_other)
+    return tally, [*confusion, _count_same_prediction(pairs), *tally.table_cells]
 
 
 def _count_same_prediction(pairs: Rows) -> int:
-    return int((pairs[f"{PREDICTION} rendered"] == pairs[PREDICTION]).sum())
+    return int(
+        (pairs[f"{PREDICTION_COLUMN} rendered"] == pairs[PREDICTION_COLUMN]).sum()
+    )
 
 
-def _describe_agreement(name: str, tally: Tally, pairs: Rows) -> str:
+def _describe_agreement(name: str, tally: ClusteredFraction, pairs: Rows) -> str:
     """Describe how often predictions about renderings and other images agree."""
     n_same = _count_same_prediction(pairs)
     return (
         f"Renderings and {name}: "
-        f"{tally.told('right about both or wrong about both')}. "
+        f"{tally.describe('right about both or wrong about both')}. "
         f"{_describe_where(True, pairs)} {_describe_where(False, pairs)} "
         f"The prediction is the same in {n_same} of {len(pairs)} "
         f"({wording.percent(n_same / len(pairs))})."
@@ -904,22 +931,24 @@ def _describe_where(right: bool, pairs: Rows) -> str:
     selected = pairs[pairs["correct rendered"] == right]
     if selected.empty:
         return f"It is {verb} about none of the renderings."
-    rate = Tally.over("", selected, selected["correct"] == right).told(verb)
+    rate = ClusteredFraction.from_rows(
+        "", selected, selected["correct"] == right
+    ).describe(verb)
     return f"Where it is {verb} about the rendering, it is {rate} about the other."
 
 
-def scaling(rows: Rows, options: Options) -> MadeFigure:
+def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
     """Make a figure of the throughput of sweeps, images per second, by worker count.
 
     Raises:
         InputError: if no sweep sets `workers`, or a run is too short.
     """
-    if WORKERS not in rows:
+    if WORKERS_COLUMN not in rows:
         raise InputError(
             "figures: scaling: expected sweeps with `workers` among the parts, got none"
         )
     # grouping leaves out the rows of sweeps that do not set the workers
-    runs = rows.groupby([WORKERS, "object"], sort=False)["time"].agg(
+    runs = rows.groupby([WORKERS_COLUMN, "object"], sort=False)["time"].agg(
         _compute_throughput
     )
     rates_by_count = {
@@ -947,7 +976,7 @@ def scaling(rows: Rows, options: Options) -> MadeFigure:
         "pictures a second",
         "times as many as the fewest workers",
     ]
-    return MadeFigure(
+    return FigureContent(
         "Pictures a second by number of workers", text, heads, table, draw, (6.0, 3.4)
     )
 
@@ -1055,7 +1084,7 @@ def _format_spread(values: Any) -> str:
     return f"{median} ({values.min():.3g} to {values.max():.3g})"
 
 
-def surface(rows: Rows, options: Options) -> MadeFigure:
+def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
     """Make a figure of the surface parts that are visible when predictions are wrong.
 
     Raises:
@@ -1103,4 +1132,4 @@ def surface(rows: Rows, options: Options) -> MadeFigure:
         "with right predictions",
     ]
     title = "Which parts of the surface go with wrong predictions"
-    return MadeFigure(title, text, heads, table, draw, (6.4, 2.65 * len(surfaces)))
+    return FigureContent(title, text, heads, table, draw, (6.4, 2.65 * len(surfaces)))

@@ -26,7 +26,7 @@ from advsearch.extend import (
 
 Cell = str | int | float | None
 
-NAMED = "what the recipe names"
+FROM_RECIPE = "what the recipe names"
 
 # its validators check the settings of the same names
 SCENE_SETTINGS: Any = SceneConfig
@@ -50,9 +50,9 @@ class RecipeConfig(Config):
                         "folder of its name", "a folder",
         otherwise="those taken with advsearch dashboard",
     )
-    object: str | None = setting_as_in(SweepConfig, "object", default=None, otherwise=NAMED)
+    object: str | None = setting_as_in(SweepConfig, "object", default=None, otherwise=FROM_RECIPE)
     environment: str | None = setting_as_in(
-        SceneConfig, "environment", otherwise=NAMED,
+        SceneConfig, "environment", otherwise=FROM_RECIPE,
         description="the environment map that lights the scene; several, separated by "
                     "commas",
         expects="names of environments or .hdr or .exr files",
@@ -68,7 +68,7 @@ class RecipeConfig(Config):
                                              "takes"
     )
     model: str | None = setting_as_in(
-        SceneConfig, "model", default=None, otherwise=NAMED,
+        SceneConfig, "model", default=None, otherwise=FROM_RECIPE,
         description="the network under test; several separated by commas",
     )
     labels: str | None = setting_as_in(SceneConfig, "labels")
@@ -138,7 +138,7 @@ class RecipeConfig(Config):
         return value
 
     @property
-    def title(self) -> tuple[str, ...]:
+    def title_words(self) -> tuple[str, ...]:
         """The names that a run's directory is named after: the recipe and an object."""
         objects = settings.split_names(self.object or "")
         return Path(self.recipe).stem, *(Path(name).stem for name in objects[:1])
@@ -150,7 +150,7 @@ class RecipeConfig(Config):
             return self.task
         return str(self.task["name"])
 
-    def label_of(self, name: str) -> str | None:
+    def find_label(self, name: str) -> str | None:
         """Return the right label that the settings give an object, None for its own."""
         return (
             self.label.get(name)
@@ -160,7 +160,7 @@ class RecipeConfig(Config):
 
 
 # columns of a figure's numbers that are a fraction and the bounds of its 95 % interval
-SHARES = ("share", "low", "high")
+FRACTION_COLUMNS = ("share", "low", "high")
 
 
 class RecipePart(results.Fields):
@@ -208,10 +208,10 @@ class RecipeResult(views.InNotebook, RunResult):
         return f"{len(self.figures)} figures"
 
 
-def shown(result: RecipeResult) -> ShownResult:
+def make_view(result: RecipeResult) -> ShownResult:
     """Lay out a result: each figure with its sentences and numbers, then the runs."""
     sections = [ResultPart(text=[result.about], only="page")]
-    sentences = told_once(result.figures)
+    sentences = omit_repeated_sentences(result.figures)
     for number, (figure, text) in enumerate(
         zip(result.figures, sentences, strict=True), start=1
     ):
@@ -265,14 +265,14 @@ def _shorten_names(names: str) -> str:
 
 def _format_cell(column: str, value: Cell) -> str:
     """Format a cell of a figure's numbers."""
-    if column in SHARES:
+    if column in FRACTION_COLUMNS:
         return wording.percent(value) if isinstance(value, (int, float)) else ""
     if isinstance(value, float):
         return f"{value:.4g}"
     return "" if value is None else str(value)
 
 
-def told_once(figures: Sequence[RecipeFigure]) -> list[list[str]]:
+def omit_repeated_sentences(figures: Sequence[RecipeFigure]) -> list[list[str]]:
     """Return the sentences of each figure without counts that an earlier one reports.
 
     If nothing is left, a sentence says so.

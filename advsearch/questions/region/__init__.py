@@ -7,12 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.extend import AttackConfig, RunContext, experiment
-from advsearch.questions.region.result import RegionConfig, RegionResult, claims, shown
+from advsearch.questions.region.result import (
+    RegionConfig,
+    RegionResult,
+    make_region_claims,
+    make_region_view,
+)
 
 
 def read_shared_settings(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that come from the run of `around`: scene, model, controls."""
-    return RegionConfig.shared(AttackConfig.from_yaml(file))
+    return RegionConfig.get_shared_settings(AttackConfig.from_yaml(file))
 
 
 @experiment(
@@ -21,8 +26,8 @@ def read_shared_settings(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]
     positional_args=("object", "model"),
     about="around",
     defaults_from_run=read_shared_settings,
-    view=shown,
-    claims=claims,
+    view=make_region_view,
+    claims=make_region_claims,
 )
 def region(context: RunContext[RegionConfig]) -> RegionResult:
     """Grow the box around a configuration in which the verdict stays what it is

@@ -65,7 +65,7 @@ class GrownBox:
         return float((self.high - self.low).prod())
 
 
-def grow(
+def grow_box(
     is_same: IsSame,
     center: Tensor,
     *,

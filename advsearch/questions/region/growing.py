@@ -55,7 +55,7 @@ class VariedParameters:
         """Their values at the centre (k,)."""
         return self.centre[self.coordinates]
 
-    def place(self, values: Tensor) -> Tensor:
+    def with_values(self, values: Tensor) -> Tensor:
         """Return the centre with other values (k,) of these parameters (d,)."""
         u = self.centre.clone()
         u[self.coordinates] = values
@@ -73,17 +73,19 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
             directory.find_run(config.around) / directory.CONFIG
         )
         budget = {"epsilon": attack_config.epsilon, "norm": attack_config.norm}
-    problem, warnings = workbench.problem_from_config(AttackConfig.of(config, **budget))
+    problem, warnings = workbench.problem_from_config(
+        AttackConfig.from_config(config, **budget)
+    )
     for text in warnings:
         stages.progress.message(text)
     varied = find_varied(problem, config)
-    ladder = workbench.ladder_of(config.verify_spp, config.pixel_sampler)
+    ladder = workbench.choose_ladder(config.verify_spp, config.pixel_sampler)
     verifier = workbench.Verifier.open(context.run, problem, ladder, stages)
     grown = GrownRegion()
     with context.until_interrupted():
         grown = RegionSearch(context, verifier, varied).run()
     stages.end()
-    findings = verifier.findings
+    findings = verifier.state
     return context.result(
         RegionResult,
         **vars(grown),
@@ -92,10 +94,10 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
         task=problem.task.title,
         controls=[control.name for control in problem.space.controls],
         image_formation=problem.renderer.formation,
-        clean={"moved": problem.space.moved},
+        clean={"moved": problem.space.adjusted_defaults},
         warnings=warnings,
         transport=findings.transport_summary
-        if findings.transport or findings.rendered_because
+        if findings.predictor or findings.predictor_refusal
         else None,
         renders=count_renders(verifier),
         seconds={**stages.seconds, "total": stages.total},
@@ -104,12 +106,12 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
 
 def count_renders(verifier: workbench.Verifier) -> dict[str, int]:
     """Return how many images were rendered, and how many predicted, if any."""
-    findings = verifier.findings
+    findings = verifier.state
     renders = {"verification": findings.verification_renders}
-    if findings.transport is not None:
-        renders["verification"] += findings.transport.traced
-    if findings.predicted_trials:
-        renders["products"] = findings.predicted_trials
+    if findings.predictor is not None:
+        renders["verification"] += findings.predictor.n_traced
+    if findings.n_predicted_trials:
+        renders["products"] = findings.n_predicted_trials
     return renders
 
 
@@ -199,7 +201,7 @@ class RegionSearch:
                 verifier, varied.centre, varied.coordinates, n_images
             )
 
-        spp = verifier.findings.spp
+        spp = verifier.state.spp
         hint = (
             f"pictures of {spp} samples a pixel; fewer parameters in `vary` or "
             "`verify_spp` shorten it"
@@ -209,7 +211,7 @@ class RegionSearch:
             "search", "growing the box", limit, hint=hint, at_most=True
         )
         seed = seeds.stream(config.seed, "region")
-        grown = boxes.grow(
+        grown = boxes.grow_box(
             self._is_same,
             varied.start,
             seed=seed,
@@ -250,12 +252,12 @@ class RegionSearch:
 
         An image without the object is neither right nor wrong.
         """
-        predictor = None if self._is_checking else self._verifier.findings.transport
-        u = self._varied.place(values)
-        (trial,) = self._verifier.trials(
-            "region", {number: u}, sought=False, predictor=predictor
+        predictor = None if self._is_checking else self._verifier.state.predictor
+        u = self._varied.with_values(values)
+        (trial,) = self._verifier.try_configurations(
+            "region", {number: u}, has_success=False, predictor=predictor
         )
-        is_counted = not trial.prediction.is_out_of_view and not trial.not_a_number
+        is_counted = not trial.prediction.is_out_of_view and not trial.is_not_a_number
         return is_counted and trial.success == self._centre_verdict
 
 
@@ -268,8 +270,8 @@ def find_verdict(verifier: workbench.Verifier, centre: Tensor) -> bool:
     """
     verifier.stages.begin("verification", "looking at the centre", CENTRE_TRIALS)
     trials = list(
-        verifier.trials(
-            "centre", dict.fromkeys(range(CENTRE_TRIALS), centre), sought=False
+        verifier.try_configurations(
+            "centre", dict.fromkeys(range(CENTRE_TRIALS), centre), has_success=False
         )
     )
     n_hidden = sum(trial.prediction.is_out_of_view for trial in trials)
@@ -279,7 +281,7 @@ def find_verdict(verifier: workbench.Verifier, centre: Tensor) -> bool:
             "the centre, so there is no "
             "verdict; choose another centre"
         )
-    n_without_number = sum(trial.not_a_number for trial in trials)
+    n_without_number = sum(trial.is_not_a_number for trial in trials)
     if n_without_number:
         raise InputError(
             f"the model's prediction is not a number in {n_without_number} of "
@@ -287,7 +289,7 @@ def find_verdict(verifier: workbench.Verifier, centre: Tensor) -> bool:
             "so there is no verdict; choose another centre, or mend the model"
         )
     n_wrong = sum(trial.success for trial in trials)
-    verdict = verifier.problem.rule.decided(n_wrong, CENTRE_TRIALS)
+    verdict = verifier.problem.rule.decide(n_wrong, CENTRE_TRIALS)
     if verdict is None:
         raise InputError(
             f"the model is wrong in {n_wrong} of {CENTRE_TRIALS} trials at the centre, "
@@ -309,9 +311,9 @@ def describe_box(
         grown: the box.
         varied: its parameters.
     """
-    low_values = problem.describe(varied.place(grown.low))
-    high_values = problem.describe(varied.place(grown.high))
-    centre_values = problem.describe(varied.place(grown.center))
+    low_values = problem.describe(varied.with_values(grown.low))
+    high_values = problem.describe(varied.with_values(grown.high))
+    centre_values = problem.describe(varied.with_values(grown.center))
     sides = []
     for index, name in enumerate(varied.names):
         described_name = name
@@ -361,7 +363,7 @@ def draw_map(
         run: where the figure is saved.
     """
     hint = (
-        f"{size * size} pictures of {verifier.findings.spp} samples a pixel; `map` "
+        f"{size * size} pictures of {verifier.state.spp} samples a pixel; `map` "
         "or `verify_spp` shorten it"
     )
     verifier.stages.begin("map", "drawing the map", size * size, hint=hint)
@@ -369,11 +371,11 @@ def draw_map(
 
     def find_configuration(number: int) -> Tensor:
         row, column = divmod(number, size)
-        return varied.place(torch.stack([steps[column], steps[row]]))
+        return varied.with_values(torch.stack([steps[column], steps[row]]))
 
-    transport = verifier.findings.transport
-    trials = verifier.trials_of(
-        "map", size * size, find_configuration, sought=False, predictor=transport
+    transport = verifier.state.predictor
+    trials = verifier.try_in_batches(
+        "map", size * size, find_configuration, has_success=False, predictor=transport
     )
     margins = [-trial.score for trial in trials]
     rows = [margins[begin : begin + size] for begin in range(0, len(margins), size)]
@@ -392,8 +394,8 @@ def find_ranges(
     problem: Problem, varied: VariedParameters, box: Sequence[BoxSide]
 ) -> list[AxisRange]:
     """Return the full range of each parameter, in its unit if it has one."""
-    low_values = problem.describe(varied.place(torch.full((2,), 0.0)))
-    high_values = problem.describe(varied.place(torch.full((2,), 1.0)))
+    low_values = problem.describe(varied.with_values(torch.full((2,), 0.0)))
+    high_values = problem.describe(varied.with_values(torch.full((2,), 1.0)))
     ranges = []
     for side in box:
         low = 0.0

@@ -19,7 +19,7 @@ from advsearch.extend import (
     wording,
 )
 
-FEWEST_SAMPLES = 8
+MIN_SAMPLES = 8
 """With fewer samples, not even a box without exceptions has one verdict in more than half
 of it, at the confidence of `questions.region.boxes.GrownBox.interval`.
 """
@@ -51,7 +51,7 @@ class RegionConfig(SceneConfig):
         "region",
         "fresh samples that check the box",
         unit="renders",
-        ge=FEWEST_SAMPLES,
+        ge=MIN_SAMPLES,
         le=1_000_000,
     )
     map: int = setting(
@@ -154,7 +154,7 @@ class RegionResult(views.InNotebook, GrownRegion, results.SceneResult):
         )
 
 
-def shown(result: RegionResult) -> ShownResult:
+def make_region_view(result: RegionResult) -> ShownResult:
     """Return the view of a region."""
     if result.box is None or result.interval is None:
         return ShownResult("Stopped before the box was known.")
@@ -177,7 +177,7 @@ def shown(result: RegionResult) -> ShownResult:
     )
 
 
-def claims(result: RegionResult) -> Iterator[views.Claim]:
+def make_region_claims(result: RegionResult) -> Iterator[views.Claim]:
     """Yield the claim about the box, if it is known."""
     if (
         not result.samples

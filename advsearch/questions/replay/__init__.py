@@ -5,7 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from advsearch.extend import PositionalArgument, RunContext, experiment
-from advsearch.questions.replay.result import ReplayConfig, ReplayResult, claims, shown
+from advsearch.questions.replay.result import (
+    ReplayConfig,
+    ReplayResult,
+    make_replay_claims,
+    make_replay_view,
+)
 
 
 @experiment(
@@ -14,8 +19,8 @@ from advsearch.questions.replay.result import ReplayConfig, ReplayResult, claims
     about="attack",
     positional=PositionalArgument("RUN", "a run"),
     python_function="advsearch.questions.replay.conditions:replay",
-    view=shown,
-    claims=claims,
+    view=make_replay_view,
+    claims=make_replay_claims,
 )
 def replay(context: RunContext[ReplayConfig], parts: Any = None) -> ReplayResult:
     """Render the adversarial scene of a run under other conditions.

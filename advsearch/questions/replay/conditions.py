@@ -186,7 +186,7 @@ def scene_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
             yield ReplayCondition("depth", description, make_problem, spp)
 
     # Mitsuba's path integrator renders no volumes.
-    if not scene.volumetric:
+    if not scene.is_volumetric:
         make_problem = partial(with_scene, problem, integrator="path")
         description = "Mitsuba's path in place of prb"
         yield ReplayCondition("integrator", description, make_problem, spp)
@@ -200,12 +200,14 @@ def scene_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
 
 def with_scene(problem: Problem, **changes: Any) -> Problem:
     """Return the problem with a new scene in which some of its options are changed."""
-    scene = problem.renderer.scene.like(**changes)
+    scene = problem.renderer.scene.copy_with(**changes)
     renderer_changes = {}
     # The renderer has a sampler of its own.
     if "sampler" in changes:
         renderer_changes["sampler"] = changes["sampler"]
-    return replace(problem, renderer=problem.renderer.like(scene, **renderer_changes))
+    return replace(
+        problem, renderer=problem.renderer.copy_with(scene, **renderer_changes)
+    )
 
 
 def image_formation_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
@@ -223,12 +225,12 @@ def image_formation_conditions(problem: Problem, spp: int) -> Iterator[ReplayCon
 
 def with_renderer(problem: Problem, **changes: Any) -> Problem:
     """Return the problem with a renderer in which some of its options are changed."""
-    return replace(problem, renderer=problem.renderer.like(**changes))
+    return replace(problem, renderer=problem.renderer.copy_with(**changes))
 
 
 def compress_as_jpeg(quality: int, image: Tensor, _seed: int) -> Tensor:
     """Return an image (H, W, 3) after JPEG compression."""
-    return images.coded(image, quality).clamp(0.0, 1.0)
+    return images.compress_jpeg(image, quality).clamp(0.0, 1.0)
 
 
 def apply_sensor(
@@ -259,7 +261,7 @@ def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
     )
     try:
         cycles = Cycles(
-            renderer.scene.made[0],
+            renderer.scene.definition[0],
             renderer.formation.resolution,
             max_depth=renderer.scene.max_depth,
             denoise=renderer.formation.denoiser != "none",
@@ -289,7 +291,7 @@ def model_condition(
 # ----------------------------------------------------------------------------------
 
 
-@workbench.asks(ReplayConfig)
+@workbench.with_settings_signature(ReplayConfig)
 def replay(
     attack: str | Path | AttackResult, *, progress: Watched = None, **options: Any
 ) -> ReplayResult:
@@ -318,9 +320,9 @@ def replay(
         ]
         if attack.parts is not None:
             parts = attack.parts()
-    config = workbench.configured(ReplayConfig, attack=run, **options)
+    config = workbench.make_config(ReplayConfig, attack=run, **options)
     if python_only:
-        config = config.with_only_here(python_only)
+        config = config.with_python_only_parts(python_only)
     result: ReplayResult = workbench.get_experiment("replay").run(
         config, progress=workbench.watcher(progress), parts=parts
     )
@@ -347,20 +349,20 @@ def run_replay(
     config = context.config
     context.progress.stage(workbench.LOADING)
     attack_directory = directory.find_run(config.attack)
-    attack = workbench.attack_of(attack_directory)
+    attack = workbench.load_attack_summary(attack_directory)
     if attack.adversarial is None:
         raise InputError(
             f"{attack_directory}: ended with {attack.ending!r}, so that there is no "
             "adversarial configuration to render again"
         )
-    settings.check_once((RUN_MODEL, *config.models), "model")
-    parts = parts or workbench.parts_in(attack_directory)
+    settings.check_no_duplicates((RUN_MODEL, *config.models), "model")
+    parts = parts or workbench.load_parts_of_run(attack_directory)
     threads = {} if config.threads is None else {"threads": config.threads}
-    load_problem = partial(workbench.problem_of_parts, parts, **threads)
+    load_problem = partial(workbench.make_problem_with_warnings, parts, **threads)
     problem, warnings = load_problem()
     warnings += describe_changed_file(attack_directory, parts)
 
-    u = workbench.kept_configuration(attack_directory, problem)
+    u = workbench.read_stored_configuration(attack_directory, problem)
     spp = verification_spp(attack)
     conditions = select_conditions(config, problem, spp, load_problem)
     seed = seeds.stream(parts.config.seed, "replay")
@@ -414,7 +416,9 @@ def select_conditions(
     )
     conditions = [unchanged]
     conditions += [
-        condition for condition in other_conditions if condition.name in config.chosen
+        condition
+        for condition in other_conditions
+        if condition.name in config.selected_names
     ]
     for model_name in config.models:
         other_problem = load_problem(model=model_name, ensemble=None)[0]
@@ -523,17 +527,19 @@ class _Table:
             seed=self.seed,
         )
         clean_results = {
-            condition: workbench.control_group(retrials.clean(retrial), retrial.spp)
+            condition: workbench.make_control_group(
+                retrials.try_clean(retrial), retrial.spp
+            )
             for condition, retrial in retrial_of.items()
         }
         for condition, retrial in retrial_of.items():
-            verification = retrials.adversarial("answer", self.u, retrial)
+            verification = retrials.try_adversarial("answer", self.u, retrial)
             self.rows[condition] = ReplayRow(
                 way=condition.name,
                 condition=condition.description,
                 ending=verification.ending.value,
                 clean=clean_results[condition],
-                verified=workbench.verified_rate(verification),
+                verified=workbench.make_verified_rate(verification),
             )
 
 

@@ -248,7 +248,7 @@ class Cycles:
         scene = self._description
         height, width = self._resolution
         values = {name: value.detach().cpu() for name, value in inputs.items()}
-        meshes = [workbench.posed(part, values) for part in scene.meshes.values()]
+        meshes = [workbench.pose_mesh(part, values) for part in scene.meshes.values()]
         meshes += _make_ground(scene, values.get("ground.reflectance"))
         radiance = None
         if scene.environment is not None:
@@ -283,7 +283,7 @@ class Cycles:
             "denoise": self._denoise,
         }
         shapes = [_turn_for_blender(mesh) for mesh in meshes]
-        return blender_settings, workbench.glb(shapes), radiance
+        return blender_settings, workbench.encode_glb(shapes), radiance
 
 
 def _find_unsupported(description: SceneDescription) -> list[str]:
@@ -316,7 +316,7 @@ def _describe_lamps(
         ball: list[list[float]] | None = None
         if isinstance(lamp, parts.BallLamp):
             default_ball = torch.from_numpy(
-                assets.pose_of(lamp.radius * np.eye(3), lamp.place)
+                assets.make_pose(lamp.radius * np.eye(3), lamp.center)
             )
             ball = values.get(f"{lamp.name}.ball", default_ball).double().tolist()
             color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
@@ -356,12 +356,12 @@ def _make_ground(
     """
     photograph = scene.photograph
     if photograph is not None:
-        base = photograph.base if reflectance is None else reflectance
+        base = photograph.base_color if reflectance is None else reflectance
         texture = color.linear_to_srgb(base.clamp(0.0, 1.0)).numpy()
         return [assets.Shape("ground", photograph.mesh, texture, MATT)]
 
     half_size = np.float32(scene.number("ground.size") / 2.0)
-    if half_size <= 0.0 or workbench.paved(scene):
+    if half_size <= 0.0 or workbench.is_paved(scene):
         return []
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)

@@ -82,8 +82,8 @@ class ReplayConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-replay-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    _named = settings.texts("attack", "run", several=["ways", "model"])
-    _different = settings.each_once("ways")
+    _named = settings.text_validator("attack", "run", several=["ways", "model"])
+    _different = settings.unique_names_validator("ways")
 
     @field_validator("ways")
     @classmethod
@@ -93,7 +93,7 @@ class ReplayConfig(Config):
         return value
 
     @property
-    def chosen(self) -> tuple[str, ...]:
+    def selected_names(self) -> tuple[str, ...]:
         """The names of the conditions that are rendered."""
         return WAYS if self.ways is None else settings.split_names(self.ways)
 
@@ -103,7 +103,7 @@ class ReplayConfig(Config):
         return () if self.model is None else settings.split_names(self.model)
 
     @property
-    def title(self) -> tuple[str, ...]:
+    def title_words(self) -> tuple[str, ...]:
         return Path(self.attack).name, self.command
 
 
@@ -178,7 +178,7 @@ VERDICTS = {HOLDS: "holds", CLEAN_IS_WRONG: "clean is wrong too"}
 """By status; all others do not hold."""
 
 
-def shown(result: ReplayResult) -> ShownResult:
+def make_replay_view(result: ReplayResult) -> ShownResult:
     """Return the table of conditions, for a terminal or a page."""
     table = ResultPart(
         "Under other conditions",
@@ -192,7 +192,7 @@ def shown(result: ReplayResult) -> ShownResult:
         ", ".join(result.controls),
     ]
     facts = {"attack": result.answer, "model": result.model}
-    return ShownResult(replay_text(result), [table], facts, about)
+    return ShownResult(summarize_replay(result), [table], facts, about)
 
 
 def make_cells(row: ReplayRow) -> list[str]:
@@ -209,7 +209,7 @@ def make_cells(row: ReplayRow) -> list[str]:
     ]
 
 
-def claims(result: ReplayResult) -> Iterator[views.Claim]:
+def make_replay_claims(result: ReplayResult) -> Iterator[views.Claim]:
     """Yield a claim for each condition."""
     for row in result.table:
         name = f"the adversarial scene of {PurePath(result.answer).name}, {row.way}"
@@ -218,7 +218,7 @@ def claims(result: ReplayResult) -> Iterator[views.Claim]:
         yield views.Claim.of_case(name, row.ending, row.verified)
 
 
-def replay_text(result: ReplayResult) -> str:
+def summarize_replay(result: ReplayResult) -> str:
     """Summarise in words under which conditions the adversarial scene holds."""
     changed = [row for row in result.table[1:] if row.ending != NOT_DONE]
     if not result.table or (result.table[0].ending == NOT_DONE and not changed):

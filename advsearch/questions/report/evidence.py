@@ -29,15 +29,15 @@ from advsearch.extend import (
     workbench,
 )
 from advsearch.questions.report.recorded import (
-    CLAIM,
+    CLAIM_KIND,
     RecordedSettings,
-    attacks_read,
-    made_with,
-    noted_settings,
-    own_settings,
-    recorded_settings,
-    stated,
-    sweeps_read,
+    collect_settings,
+    collect_versions,
+    find_read_attacks,
+    find_read_sweeps,
+    join_values,
+    read_noted_settings,
+    read_run_settings,
 )
 from advsearch.questions.report.result import ConditionShare, Evidence, EvidenceRun
 
@@ -80,14 +80,14 @@ def is_sweep(result: results.Result) -> TypeGuard[workbench.SweepSummary]:
     return isinstance(result, workbench.get_experiment("sweep").result)
 
 
-def nothing_claimed(why: str) -> views.Claim:
+def make_empty_claim(reason: str) -> views.Claim:
     """Return the claim of a run that carries none, with the reason."""
     return views.Claim(
-        kind="nothing claimed", statement=f"Nothing is claimed: {why}.", extent=None
+        kind="nothing claimed", statement=f"Nothing is claimed: {reason}.", extent=None
     )
 
 
-def conditions_of(
+def count_conditions(
     result: results.Result, photographs: Sequence[Any] | None = None
 ) -> list[ConditionShare]:
     """Count right predictions by each value of each axis of a sweep.
@@ -143,13 +143,13 @@ def _has_value(value: float | str, of: workbench.AxisValue) -> bool:
     return of[0] <= value <= of[1] if isinstance(of, tuple) else math.isclose(value, of)
 
 
-def triggering_conditions(result: results.Result) -> list[str]:
+def list_triggering_conditions(result: results.Result) -> list[str]:
     """Return rules under which the model is wrong more often."""
     triggering = workbench.get_experiment(result.command).triggering
     return [] if triggering is None else list(triggering(result))
 
 
-def met(criterion: float, interval: results.Interval) -> str:
+def evaluate_criterion(criterion: float, interval: results.Interval) -> str:
     """Return whether an interval is above a criterion (met), below (not met) or open."""
     lower, upper = interval
     if lower >= criterion:
@@ -157,7 +157,7 @@ def met(criterion: float, interval: results.Interval) -> str:
     return "not met" if upper < criterion else "open"
 
 
-def chosen_axes(result: results.Result) -> list[str]:
+def find_selected_axes(result: results.Result) -> list[str]:
     """Return the axes of a sweep with several values that somebody chose.
 
     They are not sampled, so that a fraction over them depends on the choice.
@@ -172,11 +172,11 @@ def chosen_axes(result: results.Result) -> list[str]:
     ]
 
 
-def criterion_lines(
+def describe_criterion(
     claims: Sequence[views.Claim],
     conditions: Sequence[ConditionShare],
     criterion: float,
-    chosen: Sequence[str] = (),
+    selected_axes: Sequence[str] = (),
 ) -> list[str]:
     """Describe whether a criterion, a minimum fraction that is right, is met.
 
@@ -188,22 +188,24 @@ def criterion_lines(
         claims: claims of the run.
         conditions: fractions by condition.
         criterion: the minimum fraction.
-        chosen: axes whose values were chosen.
+        selected_axes: axes whose values were chosen.
     """
-    verdicts = {row.condition: met(criterion, row.interval) for row in conditions}
+    verdicts = {
+        row.condition: evaluate_criterion(criterion, row.interval) for row in conditions
+    }
     lines = []
-    if chosen and conditions:
+    if selected_axes and conditions:
         counts = Counter(verdicts.values())
         lines.append(
             f"At least {wording.percent(criterion)}, each condition by its own 95 % "
             f"interval: met in {counts['met']}, "
             f"not met in {counts['not met']} and open in {counts['open']} of "
             f"{len(verdicts)}. There is no verdict over "
-            f"all: the values of {', '.join(chosen)} were chosen."
+            f"all: the values of {', '.join(selected_axes)} were chosen."
         )
     else:
-        lines += _criterion_of_claims(claims, criterion, chosen)
-    for verdict in ("not met", "open") if chosen else ("not met",):
+        lines += _criterion_of_claims(claims, criterion, selected_axes)
+    for verdict in ("not met", "open") if selected_axes else ("not met",):
         names = [condition for condition, known in verdicts.items() if known == verdict]
         if names:
             lines.append(f"{verdict.capitalize()} where: {', '.join(names)}.")
@@ -228,7 +230,7 @@ def _criterion_of_claims(
         if "right" in extent.what or "held-out" in extent.what:
             lines.append(
                 f"At least {wording.percent(criterion)}: "
-                f"{met(criterion, extent.interval)} by {extent.count} of "
+                f"{evaluate_criterion(criterion, extent.interval)} by {extent.count} of "
                 f"{extent.total} {extent.what}, 95 % interval "
                 f"{wording.interval_text(extent.interval)}.{remark}"
             )
@@ -265,7 +267,7 @@ def read_exposure(path: str) -> dict[str, dict[str, float]]:
     return exposure
 
 
-def exposure_lines(
+def describe_exposure(
     result: results.Result, conditions: Sequence[ConditionShare], exposure: Exposure
 ) -> list[str]:
     """Describe the fraction of right predictions weighted by how common values are.
@@ -329,7 +331,7 @@ class Variation(Enum):
     """Whether a part of an operational design domain varied."""
 
     VARIED = ""
-    WITH_PLACE = "as each environment has it"
+    WITH_ENVIRONMENT = "as each environment has it"
     FIXED = "not varied"
 
 
@@ -345,7 +347,7 @@ class DomainPart(NamedTuple):
         return ": ".join(filter(None, (self.variation.value, self.description)))
 
 
-def domain_of(
+def describe_domain(
     result: results.Result,
     recorded: Sequence[RecordedSettings],
     searched: Sequence[str],
@@ -361,9 +363,9 @@ def domain_of(
     controls = [*getattr(result, "controls", ()), *getattr(result, "over", ())]
     domain = dict[str, DomainPart]()
     for part in (*DOMAIN, OTHER):
-        varied = [line for line in searched if part_of_domain(line) == part]
+        varied = [line for line in searched if find_domain_part(line) == part]
         if not varied:
-            varied = [name for name in controls if part_of_domain(name) == part]
+            varied = [name for name in controls if find_domain_part(name) == part]
         drives = getattr(result, "drives", None) or []
         if part == "ways and speeds" and drives:
             drive = drives[0]
@@ -379,7 +381,9 @@ def domain_of(
     if domain["place"].variation is Variation.VARIED:
         for part in ("light", "weather"):
             if domain[part].variation is Variation.FIXED:
-                domain[part] = domain[part]._replace(variation=Variation.WITH_PLACE)
+                domain[part] = domain[part]._replace(
+                    variation=Variation.WITH_ENVIRONMENT
+                )
     return domain
 
 
@@ -388,11 +392,13 @@ def _fixed_domain(
 ) -> dict[str, list[str]]:
     """Return the fixed values of each part of an operational design domain."""
     fixed = defaultdict[str, list[str]](list)
-    environment = getattr(result, "environment", "") or stated(recorded, "environment")
+    environment = getattr(result, "environment", "") or join_values(
+        recorded, "environment"
+    )
     fixed["place"].append(str(environment))
-    things = (str(getattr(result, "object", "") or ""), stated(recorded, "things"))
+    things = (str(getattr(result, "object", "") or ""), join_values(recorded, "things"))
     fixed["road users and things"].append("; ".join(filter(None, things)))
-    fixed["camera and picture"].append(stated(recorded, "camera"))
+    fixed["camera and picture"].append(join_values(recorded, "camera"))
     # each value once
     values = dict[tuple[str, str], None]()
     for run_settings in recorded:
@@ -401,11 +407,11 @@ def _fixed_domain(
             for name, value in fixed_values.items():
                 values[str(name), str(value)] = None
     for name, value in values:
-        fixed[part_of_domain(name)].append(f"{name} {value}")
+        fixed[find_domain_part(name)].append(f"{name} {value}")
     return fixed
 
 
-def part_of_domain(name: str) -> str:
+def find_domain_part(name: str) -> str:
     """Return the part of a domain that an axis, a control or a parameter belongs to."""
     beginning = re.match(r"\w+", name)
     if beginning is not None:
@@ -440,28 +446,28 @@ QUICK = (
 )
 
 
-def claims_of(result: results.Result) -> list[views.Claim]:
+def collect_claims(result: results.Result) -> list[views.Claim]:
     """Return the claims of a run; a run without any has a reason."""
     if result.goes_on:
         is_running = getattr(result, "ending", "") == results.RUNNING
         reason = f"the run {'is running' if is_running else 'is not finished'}"
         if result.brief:
             reason += f"; so far: {result.brief}"
-        return [nothing_claimed(reason)]
+        return [make_empty_claim(reason)]
     read_claims = workbench.get_experiment(result.command).claims
     if not read_claims:
         return [
-            nothing_claimed(
+            make_empty_claim(
                 f"the command {result.command} does not measure how often a model is "
                 "right"
             )
         ]
     return list(read_claims(result)) or [
-        nothing_claimed("nothing in this run came to its end")
+        make_empty_claim("nothing in this run came to its end")
     ]
 
 
-def photo_claims(photos: Any) -> list[views.Claim]:
+def list_photograph_claims(photos: Any) -> list[views.Claim]:
     """Return the claim of a table of agreement (`advsearch.photo_agreement`), if not empty."""
     if not photos.photos or photos.interval is None:
         return []
@@ -482,7 +488,9 @@ def photo_claims(photos: Any) -> list[views.Claim]:
     ]
 
 
-def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
+def warn_of_different_models(
+    models: Sequence[str], digests: Sequence[str]
+) -> list[str]:
     """Warn if several runs are of different models.
 
     Args:
@@ -512,7 +520,7 @@ def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
 
 NOT_NOTED = "not noted"
 # the environment of a scene with its own lights
-NO_MAP = "none"
+NO_ENVIRONMENT_MAP = "none"
 NO_CLAIM = "The run carries no claim; it is listed so that it is not left out unseen."
 WEIGHTED = "How common the conditions are is what the weights say, of their axes alone."
 NOT_WEIGHTED = (
@@ -520,12 +528,12 @@ NOT_WEIGHTED = (
 )
 
 
-def evidence_of(
+def describe_run(
     name: str,
     result: results.Result,
     claims: Sequence[views.Claim],
     recorded: Sequence[RecordedSettings],
-    made: Mapping[str, str],
+    versions: Mapping[str, str],
 ) -> EvidenceRun:
     """Return a run with what a reader needs to evaluate its claims.
 
@@ -534,7 +542,7 @@ def evidence_of(
         result: its result.
         claims: its claims.
         recorded: the settings that it recorded, its own first.
-        made: versions and digests that it noted.
+        versions: versions and digests that it noted.
     """
     run_settings = recorded[0].values if recorded else {}
     values = {field: getattr(result, field) for field in type(result).model_fields}
@@ -553,7 +561,7 @@ def evidence_of(
         ending=str(values.get("ending") or "done"),
         claims=list(claims),
         about=_describe_subject(result, recorded),
-        searched=searched_lines(result, run_settings),
+        searched=describe_searched(result, run_settings),
         measured=_describe_measurement(result, run_settings, recorded),
         excluded=_describe_excluded(result, claims),
         settings=setting_texts,
@@ -561,7 +569,7 @@ def evidence_of(
             "Renders": renders_text,
             "Time": wording.seconds_text(seconds.get("total")),
         },
-        made_with=dict(made) or {"versions and files": NOT_NOTED},
+        made_with=dict(versions) or {"versions and files": NOT_NOTED},
         command_line=str(values.get("command_line") or ""),
     )
 
@@ -572,7 +580,7 @@ def _describe_subject(
     """Return object, environment, model, task and what counts as right, by name."""
     values = {field: getattr(result, field) for field in type(result).model_fields}
     objects = values.get("object") or ", ".join(values.get("objects") or ())
-    right = values.get("label_set") or stated(
+    right = values.get("label_set") or join_values(
         recorded, "label", "the object's own label"
     )
     environment = str(values.get("environment") or "")
@@ -588,18 +596,20 @@ def _describe_subject(
         "Object": str(objects or ""),
         "Environment": environment,
         "Model": str(values.get("model") or ""),
-        "Names of its classes": stated(recorded, "labels"),
-        "Prompt": stated(recorded, "prompt"),
-        "Range of its input": stated(recorded, "value_range"),
+        "Names of its classes": join_values(recorded, "labels"),
+        "Prompt": join_values(recorded, "prompt"),
+        "Range of its input": join_values(recorded, "value_range"),
         "Task": str(values.get("task") or ""),
-        "Judged thing": stated(recorded, "judge"),
+        "Judged thing": join_values(recorded, "judge"),
         "Counts as right": ", ".join(right) if isinstance(right, list) else right,
         "Sought": str(values.get("goal") or ""),
     }
     return {name: text for name, text in subject.items() if text}
 
 
-def searched_lines(result: results.Result, settings: Mapping[str, object]) -> list[str]:
+def describe_searched(
+    result: results.Result, settings: Mapping[str, object]
+) -> list[str]:
     """Describe what varied in a run: parameters with ranges, and controls."""
     lines = []
     if is_attack(result):
@@ -738,10 +748,10 @@ def _describe_excluded(
 
 
 # maximum bytes of a picture that is copied
-MOST_OF_PICTURE = 16 << 20
+MAX_PICTURE_BYTES = 16 << 20
 
 
-def collected(
+def collect_evidence(
     runs: list[str],
     *,
     criterion: float | None = None,
@@ -786,7 +796,7 @@ def _list_folders(runs: Sequence[str]) -> list[Path]:
     for folder in map(directory.find_run, runs):
         candidates = sorted((folder / directory.PARTS).glob("*"))
         parts = [part for part in candidates if directory.is_run(part)]
-        if parts and own_settings(folder).get("command") == "recipe":
+        if parts and read_run_settings(folder).get("command") == "recipe":
             folders |= {part.resolve(): part for part in parts}
         else:
             folders[folder.resolve()] = folder
@@ -799,7 +809,7 @@ def _read_pictures(folder: Path, number: int) -> dict[str, bytes]:
     files = [file for file in files if file.is_file() and not file.is_symlink()]
     return {
         f"pictures/{number}-{file.name}": stored_files.read_bytes(
-            file, "a picture", MOST_OF_PICTURE
+            file, "a picture", MAX_PICTURE_BYTES
         )
         for file in files[:3]
     }
@@ -825,7 +835,7 @@ def _compare_models(runs: Sequence[EvidenceRun]) -> list[str]:
         texts = [text for name, text in run.made_with.items() if name in file_names]
         models.append(model)
         digests.append(" ".join(texts))
-    return warnings_over(models, digests)
+    return warn_of_different_models(models, digests)
 
 
 def _make_evidence_run(
@@ -836,30 +846,33 @@ def _make_evidence_run(
         return _make_unfinished_run(folder)
     result = read_result(folder)
     claims_of_photographs, photo_rows = _read_photographs(folder)
-    claims = [*claims_of(result), *claims_of_photographs]
-    read_paths = [*sweeps_read(result), *attacks_read(own_settings(folder))]
-    recorded = recorded_settings(folder, result, read_paths)
+    claims = [*collect_claims(result), *claims_of_photographs]
+    read_paths = [
+        *find_read_sweeps(result),
+        *find_read_attacks(read_run_settings(folder)),
+    ]
+    recorded = collect_settings(folder, result, read_paths)
     versions = _collect_versions(folder, result, read_paths)
-    run = evidence_of(directory.typed_name(folder), result, claims, recorded, versions)
+    run = describe_run(directory.typed_name(folder), result, claims, recorded, versions)
 
     sweeps = _read_sweeps(result)
     searched = _list_searched(folder, result, sweeps) or run.searched
-    domain = domain_of(sweeps[0][0] if sweeps else result, recorded, searched)
-    conditions = conditions_of(result)
-    weighted = exposure_lines(result, conditions, exposure)
+    domain = describe_domain(sweeps[0][0] if sweeps else result, recorded, searched)
+    conditions = count_conditions(result)
+    weighted = describe_exposure(result, conditions, exposure)
     criterion_text = list[str]()
     if criterion is not None:
         axes = _list_chosen_axes(result, sweeps)
-        criterion_text = criterion_lines(claims, conditions, criterion, axes)
+        criterion_text = describe_criterion(claims, conditions, criterion, axes)
     return run.model_copy(
         update={
             "searched": searched,
             "excluded": [*_remark_quick(folder), *run.excluded],
             "criterion": criterion_text,
-            "triggering": triggering_conditions(result),
+            "triggering": list_triggering_conditions(result),
             "exposure": weighted,
             "conditions": conditions,
-            "photographs": conditions_of(result, photo_rows),
+            "photographs": count_conditions(result, photo_rows),
             "domain": {name: part.text for name, part in domain.items()},
             "not_shown": _describe_limits(
                 claims_of_photographs, domain, bool(weighted)
@@ -872,8 +885,8 @@ def _collect_versions(
     folder: Path, result: results.Result, read_paths: Sequence[Path]
 ) -> dict[str, str]:
     """Return versions and digests of files, without an environment that is not used."""
-    versions = made_with(folder, read_paths)
-    if getattr(result, "environment", "") == NO_MAP:
+    versions = collect_versions(folder, read_paths)
+    if getattr(result, "environment", "") == NO_ENVIRONMENT_MAP:
         from advsearch.extend import workbench  # it brings torch, which takes a second
 
         versions.pop(f"bundled environment {workbench.DEFAULT_ENVIRONMENT}", None)
@@ -888,9 +901,9 @@ def _read_sweeps(
     The result is about what varied in them.
     """
     sweeps = list[tuple[results.Result, Mapping[str, Any]]]()
-    for path in sweeps_read(result):
+    for path in find_read_sweeps(result):
         with suppress(errors.AdvsearchError):
-            sweeps.append((read_result(path), own_settings(path)))
+            sweeps.append((read_result(path), read_run_settings(path)))
     return sweeps
 
 
@@ -899,20 +912,20 @@ def _list_chosen_axes(
     sweeps: Sequence[tuple[results.Result, Mapping[str, Any]]],
 ) -> list[str]:
     """Return the axes whose values were chosen, of a run and of sweeps, each once."""
-    axes = dict.fromkeys(chosen_axes(result))
+    axes = dict.fromkeys(find_selected_axes(result))
     for sweep, _ in sweeps:
-        axes |= dict.fromkeys(chosen_axes(sweep))
+        axes |= dict.fromkeys(find_selected_axes(sweep))
     return list(axes)
 
 
 def _make_unfinished_run(folder: Path) -> EvidenceRun:
     """Return a run without a summary as evidence: it claims nothing."""
-    run_settings = own_settings(folder)
+    run_settings = read_run_settings(folder)
     subject = {
         "Object": str(run_settings.get("object") or ""),
         "Model": str(run_settings.get("model") or ""),
     }
-    claim = nothing_claimed(
+    claim = make_empty_claim(
         "the run has no result yet: it is still working, or was stopped"
     )
     return EvidenceRun(
@@ -925,7 +938,7 @@ def _make_unfinished_run(folder: Path) -> EvidenceRun:
         measured={},
         excluded=[NO_CLAIM],
         cost={},
-        made_with=made_with(folder, []) or {"versions and files": NOT_NOTED},
+        made_with=collect_versions(folder, []) or {"versions and files": NOT_NOTED},
         settings=RecordedSettings("", run_settings).as_text(),
         command_line=f"advsearch run {folder / directory.CONFIG}",
     )
@@ -937,7 +950,7 @@ def _read_photographs(folder: Path) -> tuple[list[views.Claim], list[Any]]:
         return [], []
     from advsearch.extend import workbench  # it brings torch, which takes a second
 
-    claims = photo_claims(workbench.load_photographs().agreement(folder))
+    claims = list_photograph_claims(workbench.load_photographs().agreement(folder))
     with Store.open_to_read(folder) as store:
         rows = list(store.rows("photo")) if claims else []
     return claims, rows
@@ -949,18 +962,18 @@ def _list_searched(
     sweeps: Sequence[tuple[results.Result, Mapping[str, Any]]],
 ) -> list[str]:
     """Describe what varied in the claims of a suite, or in the sweeps that were read."""
-    noted = noted_settings(folder, result)
+    noted = read_noted_settings(folder, result)
     if noted is not None:
-        return _searched_by_claims(noted.get(CLAIM))
+        return _searched_by_claims(noted.get(CLAIM_KIND))
     lines = dict[str, None]()
     for sweep, sweep_settings in sweeps:
-        lines |= dict.fromkeys(searched_lines(sweep, sweep_settings))
+        lines |= dict.fromkeys(describe_searched(sweep, sweep_settings))
     return list(lines)
 
 
 def _remark_quick(folder: Path) -> list[str]:
     """Return a remark if a run is a part of a quick recipe."""
-    outer = own_settings(folder.resolve().parent.parent)
+    outer = read_run_settings(folder.resolve().parent.parent)
     is_quick = outer.get("command") == "recipe" and outer.get("quick") is True
     return [QUICK] if is_quick else []
 

@@ -22,13 +22,13 @@ from advsearch.extend import (
 )
 
 # the kind of settings that a suite noted for each of its claims
-CLAIM = "claim"
-NOT_SETTINGS = ("schema", "command", "base", *settings.PLACE)
+CLAIM_KIND = "claim"
+NOT_SETTINGS = ("schema", "command", "base", *settings.RUN_LOCATION)
 # settings that name an attack's run
-ATTACKS = ("attack", "adversarial_of", "around")
+ATTACK_SETTINGS = ("attack", "adversarial_of", "around")
 DEFAULT_TASK = "classification"
 # characters after which a value is cut
-LONGEST = 2000
+MAX_VALUE_LENGTH = 2000
 
 
 @dataclass
@@ -46,7 +46,7 @@ class RecordedSettings:
     @property
     def task(self) -> str:
         """The task in words, with its thresholds."""
-        return task_text(
+        return describe_task(
             self.values.get("task") or DEFAULT_TASK, self.values.get("objective")
         )
 
@@ -113,20 +113,20 @@ class RecordedSettings:
         return set()
 
 
-def task_text(named: Any, objective: object) -> str:
+def describe_task(task: Any, objective: object) -> str:
     """Return a task in words with all of its options, also default ones.
 
     Args:
-        named: name of the task, or a mapping with its name and options.
+        task: name of the task, or a mapping with its name and options.
         objective: an objective that defines success, or None.
     """
     options = ", ".join(
         f"{option} {wording.number_text(value)}"
-        for option, value in _task_options(named, objective).items()
+        for option, value in _task_options(task, objective).items()
     )
     if not options:
-        return _shorten(named)
-    name = str(named.get("name") if isinstance(named, Mapping) else named)
+        return _shorten(task)
+    name = str(task.get("name") if isinstance(task, Mapping) else task)
     return f"{name} ({options})"
 
 
@@ -135,9 +135,9 @@ def _shorten(value: object) -> str:
     text = value
     if not isinstance(text, str):
         text = json.dumps(value, ensure_ascii=False, default=str)
-    if len(text) <= LONGEST:
+    if len(text) <= MAX_VALUE_LENGTH:
         return text
-    return f"{text[:LONGEST]}... ({len(text)} characters)"
+    return f"{text[:MAX_VALUE_LENGTH]}... ({len(text)} characters)"
 
 
 def _task_options(named: Any, objective: object) -> dict[str, Any]:
@@ -148,9 +148,9 @@ def _task_options(named: Any, objective: object) -> dict[str, Any]:
     with suppress(errors.AdvsearchError):
         task = workbench.make_task(named)
         if isinstance(objective, str):
-            task = task.seeking(objective)
+            task = task.with_objective(objective)
         parts = {"": task}
-        if isinstance(task, workbench.Together):
+        if isinstance(task, workbench.EnsembleTask):
             parts = {f"{part.name}.": part for part in task.parts}
         for prefix, part in parts.items():
             for option in fields(part):
@@ -161,14 +161,14 @@ def _task_options(named: Any, objective: object) -> dict[str, Any]:
     return options
 
 
-def own_settings(folder: Path) -> Mapping[str, Any]:
+def read_run_settings(folder: Path) -> Mapping[str, Any]:
     """Return the settings in the `run.yaml` of a run, empty if it cannot be read."""
     with suppress(errors.AdvsearchError):
         return settings.read_yaml(folder / directory.CONFIG)
     return {}
 
 
-def sweeps_read(result: results.Result) -> list[Path]:
+def find_read_sweeps(result: results.Result) -> list[Path]:
     """Return the directories of the sweeps whose rows a result was made from, if they exist."""
     return _find_runs(
         [
@@ -178,9 +178,9 @@ def sweeps_read(result: results.Result) -> list[Path]:
     )
 
 
-def attacks_read(values: Mapping[str, Any]) -> list[Path]:
+def find_read_attacks(values: Mapping[str, Any]) -> list[Path]:
     """Return the directories of the attacks that settings name, if they exist."""
-    return _find_runs([values.get(name) for name in ATTACKS])
+    return _find_runs([values.get(name) for name in ATTACK_SETTINGS])
 
 
 def _find_runs(names: Iterable[object]) -> list[Path]:
@@ -192,26 +192,26 @@ def _find_runs(names: Iterable[object]) -> list[Path]:
     return folders
 
 
-def recorded_settings(
+def collect_settings(
     folder: Path, result: results.Result, read: Sequence[Path]
 ) -> list[RecordedSettings]:
     """Return the settings of a run, of its claims, and of the runs that it read.
 
     Claims are those of a suite that were tested, with its counterexamples.
     """
-    recorded = [RecordedSettings("", own_settings(folder))]
-    for kind, settings_by_name in (noted_settings(folder, result) or {}).items():
+    recorded = [RecordedSettings("", read_run_settings(folder))]
+    for kind, settings_by_name in (read_noted_settings(folder, result) or {}).items():
         recorded += [
             RecordedSettings(f"{kind} {name}", values)
             for name, values in settings_by_name.items()
         ]
     return recorded + [
-        RecordedSettings(directory.typed_name(path), own_settings(path))
+        RecordedSettings(directory.typed_name(path), read_run_settings(path))
         for path in read
     ]
 
 
-def noted_settings(
+def read_noted_settings(
     folder: Path, result: results.Result
 ) -> Mapping[str, Mapping[str, Mapping[str, Any]]] | None:
     """Return settings that a run noted besides its own, by kind and name.
@@ -227,7 +227,9 @@ def noted_settings(
     return noted
 
 
-def stated(recorded: Iterable[RecordedSettings], name: str, otherwise: str = "") -> str:
+def join_values(
+    recorded: Iterable[RecordedSettings], name: str, otherwise: str = ""
+) -> str:
     """Return the values of a setting of scenes as text, each different one once.
 
     `otherwise` stands for settings without a value.
@@ -240,7 +242,7 @@ def stated(recorded: Iterable[RecordedSettings], name: str, otherwise: str = "")
     return "; ".join(dict.fromkeys(filter(None, texts)))
 
 
-def made_with(folder: Path, read: Sequence[Path]) -> dict[str, str]:
+def collect_versions(folder: Path, read: Sequence[Path]) -> dict[str, str]:
     """Return versions and digests of files that a run was made with, by name.
 
     They include those of its parts and of the runs that it read; different ones are

@@ -97,7 +97,9 @@ class Evidence(results.Result):
     )
 
 
-def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
+def make_tables(
+    run: EvidenceRun,
+) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
     """Yield title, heads and rows of the tables of a run."""
     for title, first, verb, conditions in (
         ("Right", "condition", "right", run.conditions),
@@ -116,7 +118,7 @@ def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[
             yield title, (first, verb, "of", "95 % interval"), rows
 
 
-def markdown(evidence: Evidence) -> str:
+def format_markdown(evidence: Evidence) -> str:
     """Return evidence as Markdown."""
     lines = ["# Evidence", "", *(f"> {text}" for text in evidence.warnings)]
     if evidence.warnings:
@@ -124,7 +126,7 @@ def markdown(evidence: Evidence) -> str:
     for run in evidence.runs:
         lines += _run_markdown(run)
     lines += ["## How to read this", "", *(f"- {text}" for text in evidence.rules), ""]
-    return "\n".join([*lines, _signed(evidence)]) + "\n"
+    return "\n".join([*lines, _describe_author(evidence)]) + "\n"
 
 
 def _run_markdown(run: EvidenceRun) -> list[str]:
@@ -132,14 +134,14 @@ def _run_markdown(run: EvidenceRun) -> list[str]:
     lines = [f"## {_plain(run.run)}", ""]
     lines += [f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in run.claims]
     lines.append("")
-    for _, heads, rows in tables_of(run):
+    for _, heads, rows in make_tables(run):
         for cells in (heads, ["---"] * len(heads), *rows):
             lines.append(f"| {' | '.join(map(_plain, cells))} |")
         lines.append("")
     if run.pictures:
         lines += [f"![{name}]({name})" for name in run.pictures]
         lines.append("")
-    for title, facts in sections(run).items():
+    for title, facts in make_sections(run).items():
         lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in facts), ""]
     if run.command_line:
         command = run.command_line.replace("```", "` ` `")
@@ -147,7 +149,7 @@ def _run_markdown(run: EvidenceRun) -> list[str]:
     return lines
 
 
-def _signed(evidence: Evidence) -> str:
+def _describe_author(evidence: Evidence) -> str:
     """State who wrote the evidence, when, and with which version."""
     by = f" by {_plain(evidence.by)}" if evidence.by else ""
     return (
@@ -156,7 +158,7 @@ def _signed(evidence: Evidence) -> str:
     )
 
 
-def sections(run: EvidenceRun) -> dict[str, list[str]]:
+def make_sections(run: EvidenceRun) -> dict[str, list[str]]:
     """Return the lines of the sections of a run by title, without empty ones."""
 
     def list_facts(facts: Mapping[str, str]) -> list[str]:
@@ -190,7 +192,7 @@ def _plain(text: str) -> str:
 CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
 
 
-def evidence_page(
+def make_evidence_page(
     evidence: Evidence, pictures: Mapping[str, bytes] | None = None
 ) -> str:
     """Return evidence as a page, with pictures (PNG) by name."""
@@ -205,14 +207,14 @@ def evidence_page(
         *(_run_html(run, pictures or {}) for run in evidence.runs),
         markup.element("h2", "How to read this"),
         markup.element("ul", *rules),
-        markup.element("p", _signed(evidence), class_="soft"),
+        markup.element("p", _describe_author(evidence), class_="soft"),
     )
-    header = markup.heading(
+    header = markup.make_header(
         f"evidence; {n_carried} of {len(claims)} statements carry a claim",
         summary,
         evidence.warnings,
     )
-    return markup.document(
+    return markup.make_document(
         "evidence", header, main, footer="evidence. This page needs no other file."
     )
 
@@ -233,11 +235,11 @@ def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
         rows.append([claim.kind, claim.statement, *counted])
     parts = [
         markup.element("h2", f"{run.run} ({run.command})"),
-        markup.study_table(CLAIM_HEADS, rows),
+        markup.make_table(CLAIM_HEADS, rows),
     ]
     if run.pictures:
         data = {
-            name: markup.data_url(pictures[name], "image/png")
+            name: markup.make_data_url(pictures[name], "image/png")
             for name in run.pictures
             if name in pictures
         }
@@ -246,10 +248,10 @@ def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
             for name, url in data.items()
         )
         parts.append(markup.element("div", *images, class_="pictures"))
-    for title, heads, cells in tables_of(run):
+    for title, heads, cells in make_tables(run):
         summary = markup.element("summary", f"{title} by condition, {len(cells)} rows")
         parts.append(
-            markup.element("details", summary, markup.study_table(heads, cells))
+            markup.element("details", summary, markup.make_table(heads, cells))
         )
     facts = [
         markup.element(
@@ -257,7 +259,7 @@ def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
             markup.element("th", name, scope="row"),
             markup.element("td", *(markup.element("div", line) for line in lines)),
         )
-        for name, lines in sections(run).items()
+        for name, lines in make_sections(run).items()
     ]
     table = markup.element("table", markup.element("tbody", *facts), class_="facts")
     parts.append(

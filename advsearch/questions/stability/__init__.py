@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from advsearch.extend import RunContext, errors, experiment
-from advsearch.questions.stability.result import StabilityConfig, StabilityResult, shown
+from advsearch.questions.stability.result import (
+    StabilityConfig,
+    StabilityResult,
+    make_view,
+)
 
 
 @experiment(
@@ -16,7 +20,7 @@ from advsearch.questions.stability.result import StabilityConfig, StabilityResul
     exit_status=lambda result: (
         errors.FELL_SHORT if any(row.status != "ok" for row in result.rows) else 0
     ),
-    view=shown,
+    view=make_view,
 )
 def stability(context: RunContext[StabilityConfig]) -> StabilityResult:
     """Run stiff and extreme scenes, and report whether each holds (docs/stability.md)."""

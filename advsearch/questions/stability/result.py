@@ -64,12 +64,12 @@ class StabilityConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/stability-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    _named = settings.texts("run", several=["case", "group"])
-    _different = settings.each_once("case", "group")
+    _named = settings.text_validator("run", several=["case", "group"])
+    _different = settings.unique_names_validator("case", "group")
 
     @property
     def cases(self) -> tuple[str, ...]:
-        """The names in `case`; empty for all."""
+        """The names in `register_case`; empty for all."""
         return () if self.case is None else settings.split_names(self.case)
 
     @property
@@ -105,7 +105,7 @@ class Check(results.Fields):
         return f"{text} (expected {expected})" if expected else text
 
 
-def check(
+def check_range(
     what: str, value: float, least: float | None = None, most: float | None = None
 ) -> Check:
     """Check that a number is in a range; NaN is in no range."""
@@ -117,9 +117,9 @@ def check(
     return Check(what=what, value=value, least=least, most=most, ok=ok)
 
 
-def holds(what: str, truth: bool) -> Check:
+def check_condition(what: str, truth: bool) -> Check:
     """Check a condition, as a number that has to be 1."""
-    return check(what, float(truth), 1.0, 1.0)
+    return check_range(what, float(truth), 1.0, 1.0)
 
 
 class CaseRow(results.Fields):
@@ -165,7 +165,7 @@ class StabilityResult(views.InNotebook, results.Result):
         return f"{sum(row.status == OK for row in self.rows)} of {len(self.rows)} hold"
 
 
-COLUMNS: Mapping[str, views.Column] = {
+CASE_COLUMNS: Mapping[str, views.Column] = {
     "group": "{0.group}",
     "case": "{0.case}",
     "status": "{0.status}",
@@ -178,7 +178,7 @@ COLUMNS: Mapping[str, views.Column] = {
 }
 
 
-def shown(result: StabilityResult) -> ShownResult:
+def make_view(result: StabilityResult) -> ShownResult:
     """Lay out a result: cases, condition numbers, and those that fell short."""
     failed = [row for row in result.rows if row.status != OK]
     condition_numbers = []
@@ -194,7 +194,7 @@ def shown(result: StabilityResult) -> ShownResult:
     return ShownResult(
         f"{n_rows - len(failed)} of {n_rows} cases hold, in {seconds:.0f} seconds.",
         [
-            ResultPart.table(result.rows, COLUMNS, title="Cases"),
+            ResultPart.table(result.rows, CASE_COLUMNS, title="Cases"),
             ResultPart("Condition numbers", rows=condition_numbers),
             ResultPart("Short", failures),
             ResultPart("Not run", [", ".join(result.not_run)]),
@@ -220,7 +220,7 @@ class Outcome:
     ending: str = ""
     measured: Mapping[str, float] = field(default_factory=dict)
 
-    def also(self, *more: Check, **known: Any) -> Outcome:
+    def with_checks(self, *more: Check, **known: Any) -> Outcome:
         """Return the outcome with more checks, and changed fields."""
         return replace(self, checks=[*self.checks, *more], **known)
 
@@ -236,25 +236,27 @@ class Case:
         group: group of cases.
         holds: what must hold, in a sentence.
         slow: whether it takes long.
-        find: runs the case.
+        measure: runs the case.
     """
 
     name: str
     group: str
     holds: str
     slow: bool
-    find: Callable[[], Outcome]
+    measure: Callable[[], Outcome]
 
     def run(self) -> CaseRow:
         """Run the case. An exception means that it falls short, and is the reason."""
         start = time.perf_counter()
         try:
-            outcome = self.find()
+            outcome = self.measure()
         except InputError as error:
-            failure = check(f"refused: {error}", 1.0, 0.0, 0.0)
+            failure = check_range(f"refused: {error}", 1.0, 0.0, 0.0)
             outcome = Outcome([failure], ending="refused")
         except Exception as error:
-            failure = check(f"raised {type(error).__name__}: {error}", 1.0, 0.0, 0.0)
+            failure = check_range(
+                f"raised {type(error).__name__}: {error}", 1.0, 0.0, 0.0
+            )
             outcome = Outcome([failure], finite=False, ending="raised")
         failed = [each for each in outcome.checks if not each.ok]
         if failed:
@@ -273,10 +275,10 @@ class Case:
 
 
 # every case, in the order in which they run
-CASES: list[Case] = []
+ALL_CASES: list[Case] = []
 
 
-def case(
+def register_case(
     group: str, name: str, *, slow: bool = False
 ) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
     """Register a function as a case.
@@ -286,13 +288,13 @@ def case(
 
     def register(find: Callable[[], Outcome]) -> Callable[[], Outcome]:
         sentence = " ".join((find.__doc__ or "").partition("\n\n")[0].split())
-        CASES.append(Case(name, group, sentence, slow, find))
+        ALL_CASES.append(Case(name, group, sentence, slow, find))
         return find
 
     return register
 
 
-def cases(
+def register_cases(
     group: str,
     find: Callable[..., Outcome],
     table: Iterable[tuple[str, str, dict[str, Any]]],
@@ -308,4 +310,6 @@ def cases(
     for name, sentence, data in table:
         arguments = {key: value for key, value in data.items() if key != "slow"}
         is_slow = bool(data.get("slow"))
-        CASES.append(Case(name, group, sentence, is_slow, partial(find, **arguments)))
+        ALL_CASES.append(
+            Case(name, group, sentence, is_slow, partial(find, **arguments))
+        )

@@ -23,30 +23,35 @@ from advsearch.extend import (
     results,
     workbench,
 )
-from advsearch.questions.stability.result import Check, Outcome, check, holds
+from advsearch.questions.stability.result import (
+    Check,
+    Outcome,
+    check_condition,
+    check_range,
+)
 
 # width and height of images, pixels
-SIZE = 24
+IMAGE_SIZE = 24
 # samples per pixel of a picture and of the gradients of a search
 SPP = 8
 # samples per pixel of a reference
 REFERENCE_SPP = 64
 # relative error that the mean of a gradient may have beyond what its noise explains
-ERROR = 0.1
+MAX_GRADIENT_ERROR = 0.1
 # noise of a comparison, as a fraction of the derivative, above which it decides nothing
-DOUBT = 0.4
+MAX_NOISE = 0.4
 # logits of the searched model per unit of the linear loss
-SHARPNESS = 20.0
+LOGIT_SCALE = 20.0
 # mean difference of two pictures that should be equal: an 8-bit level is 4e-3
-SAME_PICTURE = 2e-3
+MAX_PICTURE_DIFFERENCE = 2e-3
 ControlSettings = Mapping[str, Mapping[str, object]]
-Thing = str | Path | assets.ObjectAsset | Callable[[], assets.ObjectAsset]
+ObjectSource = str | Path | assets.ObjectAsset | Callable[[], assets.ObjectAsset]
 """The object of a scene; a function is called when the case runs."""
 
 
 def make_renderer(
     controls: ControlSettings,
-    thing: Thing = "mug",
+    thing: ObjectSource = "mug",
     *,
     environment: str | Path | assets.EnvironmentAsset | None = None,
     settings: Mapping[str, float] | None = None,
@@ -66,9 +71,9 @@ def make_renderer(
     for name, plugin in plugins.items():
         description = description.with_part(workbench.PluginPart(name, plugin))
     renderer = replace(scene, description=description).renderer(
-        controls, resolution=SIZE, denoise=denoise
+        controls, resolution=IMAGE_SIZE, denoise=denoise
     )
-    renderer.plan = renderer.plan.at_a_pixel()
+    renderer.plan = renderer.plan.with_pixel_steps()
     return renderer
 
 
@@ -86,9 +91,11 @@ def make_plain_environment() -> assets.EnvironmentAsset:
     return assets.EnvironmentAsset("plain", radiance)
 
 
-def make_grey_map(value: float, texel: float | None = None) -> assets.EnvironmentAsset:
+def make_gray_environment(
+    value: float, texel: float | None = None
+) -> assets.EnvironmentAsset:
     """Return a gray environment map, with one texel of another value."""
-    radiance: assets.Floats = np.full((16, 32, 3), value, np.float32)
+    radiance: assets.Float32Array = np.full((16, 32, 3), value, np.float32)
     if texel is not None:
         radiance[4, 10] = texel
     return assets.EnvironmentAsset("made", radiance)
@@ -138,7 +145,7 @@ Bounds = tuple[float | None, float | None]
 
 def check_scene(
     controls: ControlSettings,
-    thing: Thing = "mug",
+    thing: ObjectSource = "mug",
     *,
     u: Sequence[float] | Mapping[int, float] | None = None,
     spp: int = SPP,
@@ -150,7 +157,7 @@ def check_scene(
     gradient: Bounds | None = None,
     ending: str = "",
     beside: Mapping[str, object] | None = None,
-    apart: Bounds = (None, SAME_PICTURE),
+    apart: Bounds = (None, MAX_PICTURE_DIFFERENCE),
     **scene: object,
 ) -> Outcome:
     """Render a scene, differentiate it, and search from there.
@@ -178,7 +185,7 @@ def check_scene(
     start = renderer.start.clone()
     for index, value in u.items() if isinstance(u, Mapping) else enumerate(u or ()):
         start[index] = value
-    loss = gradients.smooth_loss(renderer.formation.resolution)
+    loss = gradients.make_smooth_loss(renderer.formation.resolution)
     image = render_image(renderer, start, 0, spp)
     _, slope = renderer.gradient(loss, start, 0, spp)
     relative_error = None
@@ -190,9 +197,11 @@ def check_scene(
     in_range = float(image.min()) >= 0.0 and float(image.max()) <= 1.0
     n_objectives = float(result.non_finite_objectives)
     checks = [
-        holds("the picture is in [0, 1]", in_range),
-        check("values that were NaN or infinite", float(renderer.non_finite), 0.0, 0.0),
-        check("objectives that were NaN or infinite", n_objectives, 0.0, 0.0),
+        check_condition("the picture is in [0, 1]", in_range),
+        check_range(
+            "values that were NaN or infinite", float(renderer.non_finite), 0.0, 0.0
+        ),
+        check_range("objectives that were NaN or infinite", n_objectives, 0.0, 0.0),
         *gradient_checks,
     ]
     measured = {
@@ -200,20 +209,24 @@ def check_scene(
         "largest gradient": float(slope.abs().max()),
     }
     if mean is not None:
-        checks.append(check("mean of the picture", measured["mean"], *mean))
+        checks.append(check_range("mean of the picture", measured["mean"], *mean))
     if gradient is not None:
         checks.append(
-            check("largest gradient", measured["largest gradient"], *gradient)
+            check_range("largest gradient", measured["largest gradient"], *gradient)
         )
     if ending:
-        checks.append(holds(f"the ending is {ending!r}", result.ending.value == ending))
+        checks.append(
+            check_condition(f"the ending is {ending!r}", result.ending.value == ending)
+        )
     if beside is not None:
         other = make_renderer(**{"controls": controls, **beside})  # type: ignore[arg-type]
         difference = mean_difference(
             render_image(renderer, start), render_image(other, other.start)
         )
         checks.append(
-            check("mean difference from the picture beside it", difference, *apart)
+            check_range(
+                "mean difference from the picture beside it", difference, *apart
+            )
         )
     is_finite = bool(torch.isfinite(image).all()) and bool(torch.isfinite(slope).all())
     is_finite = is_finite and renderer.non_finite == 0
@@ -231,8 +244,8 @@ def _check_gradient(
     noise_name = f"noise of the comparison, {noisiest.name}"
     error_name = f"gradient error beyond the noise, {worst.name}"
     checks = [
-        check(noise_name, noisiest.doubt or 0.0, most=DOUBT),
-        check(error_name, worst.excess, most=ERROR),
+        check_range(noise_name, noisiest.doubt or 0.0, most=MAX_NOISE),
+        check_range(error_name, worst.excess, most=MAX_GRADIENT_ERROR),
     ]
     return checks, worst.bias
 
@@ -246,14 +259,14 @@ def search_scene(
 ) -> workbench.SearchResult:
     """Search from a configuration with the margin of a linear model of two classes.
 
-    Its logits are 0, and `SHARPNESS` times the increase of the loss over the start,
+    Its logits are 0, and `LOGIT_SCALE` times the increase of the loss over the start,
     minus 1.
     """
     loss_at_start = float(loss(render_image(renderer, start, 0, spp)))
     gradient_cost = make_domain(renderer, start).gradient_cost
 
     def margin(image: Tensor) -> Tensor:
-        return SHARPNESS * (loss(image) - loss_at_start) - 1.0
+        return LOGIT_SCALE * (loss(image) - loss_at_start) - 1.0
 
     steps = evaluations * (1 + gradient_cost) + 1
     return run_search(
@@ -283,7 +296,7 @@ def compare_gradient(
     """Compare the plan's gradient of a linear loss with common-random-number differences."""
     formation = renderer.formation
     bench = gradients.Bench(
-        renderer, gradients.smooth_loss(formation.resolution), u, seed=1, spp=spp
+        renderer, gradients.make_smooth_loss(formation.resolution), u, seed=1, spp=spp
     )
     # of this renderer, which counts what is not finite
     renderer.formation = replace(formation, transfer="linear")
@@ -291,7 +304,7 @@ def compare_gradient(
         rows = gradients.measure_derivatives(
             bench,
             reference_spp=REFERENCE_SPP,
-            seeds_of_reference=seeds,
+            reference_repeats=seeds,
             repeats=(repeats, repeats),
         )
         return list(rows)
@@ -312,10 +325,10 @@ def measure_inward_slope(
     `factor` is 1. The derivative is computed by a gradient (d,), and by one-sided
     differences of second order, since a bound has no other side.
     """
-    linear = renderer.like(transfer="linear")
+    linear = renderer.copy_with(transfer="linear")
     u = renderer.start
     step = 0.04
-    loss = gradients.smooth_loss(linear.formation.resolution)
+    loss = gradients.make_smooth_loss(linear.formation.resolution)
     direction = torch.where(u > 0.5, -1.0, 1.0) * (gradient * (0.5 - u) > 0.0) * factor
     slopes = []
     for seed in range(seeds):
@@ -382,7 +395,7 @@ def make_domain(
     """Return the domain of a search from a configuration, by default the renderer's start."""
     space: Any = renderer.space  # of controls, since `make_renderer` made it
     start = renderer.start if start is None else start
-    return workbench.domain_of(
+    return workbench.make_domain(
         space.controls,
         start,
         gradient_cost=renderer.plan.renders,

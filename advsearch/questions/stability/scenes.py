@@ -24,22 +24,22 @@ from advsearch.extend import (
     workbench,
 )
 from advsearch.questions.stability.result import (
-    CASES,
+    ALL_CASES,
     Case,
     CaseRow,
     Outcome,
     StabilityConfig,
     StabilityResult,
-    case,
-    cases,
-    check,
-    holds,
+    check_condition,
+    check_range,
+    register_case,
+    register_cases,
 )
 from advsearch.questions.stability.scene import (
-    ERROR,
+    LOGIT_SCALE,
+    MAX_GRADIENT_ERROR,
+    MAX_PICTURE_DIFFERENCE,
     REFERENCE_SPP,
-    SAME_PICTURE,
-    SHARPNESS,
     SPP,
     ControlSettings,
     check_scene,
@@ -50,7 +50,7 @@ from advsearch.questions.stability.scene import (
     make_checkered_object,
     make_dark_mug,
     make_domain,
-    make_grey_map,
+    make_gray_environment,
     make_mesh,
     make_renderer,
     mean_difference,
@@ -62,8 +62,8 @@ from advsearch.questions.stability.scene import (
 BRIGHT = 1e5
 PLATEAU_STEPS = 40  # evaluations in which a search has to be off a plateau
 TEXTURE: ControlSettings = {"texture": {"resolution": 8}}
-FLASH = make_grey_map(0.3, BRIGHT)
-DARKNESS = make_grey_map(0.0)
+FLASH = make_gray_environment(0.3, BRIGHT)
+DARKNESS = make_gray_environment(0.0)
 
 
 def exposure_case(control: str, low: float, high: float) -> dict[str, object]:
@@ -76,12 +76,14 @@ def exposure_case(control: str, low: float, high: float) -> dict[str, object]:
 
 
 FINITE = "Picture and gradient are finite."
-RIGHT = "Picture and gradient are finite; the gradient of the linear picture is right."
+FINITE_AND_RIGHT = (
+    "Picture and gradient are finite; the gradient of the linear picture is right."
+)
 LAMP = {"light": {"type": "point", "power": [0.0, 20.0], "x": 1.0, "y": 1.0, "z": 2.0}}
 BRIGHT_TEXEL = {"environment": {"exposure": [-1.0, 1.0]}, "texture": {"resolution": 16}}
-TURNED = {"environment": {"rotation": [0.0, 360.0]}}
+ROTATED_ENVIRONMENT = {"environment": {"rotation": [0.0, 360.0]}}
 
-cases(
+register_cases(
     "radiometric",
     check_scene,
     [
@@ -94,7 +96,7 @@ cases(
             "hdri-texel-100000-denoised",
             "It is finite after the denoiser too, and the rotation has a gradient.",
             {
-                "controls": TURNED,
+                "controls": ROTATED_ENVIRONMENT,
                 "environment": FLASH,
                 "denoise": "oidn",
                 "u": [0.31],
@@ -126,17 +128,29 @@ cases(
                 "mean": (0.01, None),
             },
         ),
-        ("camera-exposure-up", RIGHT, exposure_case("camera", 9.0, 10.0)),
-        ("camera-exposure-down", RIGHT, exposure_case("camera", -10.0, -9.0)),
-        ("environment-exposure-up", RIGHT, exposure_case("environment", 9.0, 10.0)),
-        ("environment-exposure-down", RIGHT, exposure_case("environment", -10.0, -9.0)),
+        ("camera-exposure-up", FINITE_AND_RIGHT, exposure_case("camera", 9.0, 10.0)),
+        (
+            "camera-exposure-down",
+            FINITE_AND_RIGHT,
+            exposure_case("camera", -10.0, -9.0),
+        ),
+        (
+            "environment-exposure-up",
+            FINITE_AND_RIGHT,
+            exposure_case("environment", 9.0, 10.0),
+        ),
+        (
+            "environment-exposure-down",
+            FINITE_AND_RIGHT,
+            exposure_case("environment", -10.0, -9.0),
+        ),
     ],
 )
 
 
 def refuse_texel(value: float, as_file: bool) -> Outcome:
     """Require that a texel that is no light, in a file or an array, is rejected."""
-    radiance = make_grey_map(0.3).radiance.copy()
+    radiance = make_gray_environment(0.3).radiance.copy()
     radiance[4, 10] = value
     try:
         if as_file:
@@ -153,10 +167,10 @@ def refuse_texel(value: float, as_file: bool) -> Outcome:
     except InputError as error:
         is_clear = "texels" in str(error) and "\n" not in str(error)
         return Outcome(
-            [holds("refused in a sentence that counts the texels", is_clear)],
+            [check_condition("refused in a sentence that counts the texels", is_clear)],
             ending="refused",
         )
-    return Outcome([holds("refused", False)], ending="rendered all the same")
+    return Outcome([check_condition("refused", False)], ending="rendered all the same")
 
 
 REFUSED = "The map is refused before anything is rendered."
@@ -164,7 +178,7 @@ for word, value in (("negative", -1.0), ("infinite", math.inf), ("nan", math.nan
     for source in ("file", "array"):
         arguments = {"value": value, "as_file": source == "file"}
         table = [(f"{word}-texel-{source}", REFUSED, arguments)]
-        cases("radiometric", refuse_texel, table)
+        register_cases("radiometric", refuse_texel, table)
 
 
 def leave_plateau(low: float, high: float) -> Outcome:
@@ -188,7 +202,7 @@ def leave_plateau(low: float, high: float) -> Outcome:
         )
         n_flat += sum(record.gradient_norm == 0.0 for record in result.history)
         checks.append(
-            holds(
+            check_condition(
                 f"{policy.name} finds a picture that is not white",
                 result.best_objective > 0.0,
             )
@@ -198,7 +212,9 @@ def leave_plateau(low: float, high: float) -> Outcome:
         renderer, loss, 2, workbench.Query(start, 0, gradient=True)
     ).gradient
     assert slope is not None
-    start_check = check("gradient at the start", float(slope.abs().max()), 0.0, 0.0)
+    start_check = check_range(
+        "gradient at the start", float(slope.abs().max()), 0.0, 0.0
+    )
     counts = {"evaluations without a gradient": float(n_flat)}
     return Outcome([start_check, *checks], ending=", ".join(endings), measured=counts)
 
@@ -207,7 +223,7 @@ LEAVES_PLATEAU = (
     "From a white picture without a gradient every policy gets away within "
     f"{PLATEAU_STEPS} evaluations"
 )
-cases(
+register_cases(
     "radiometric",
     leave_plateau,
     [
@@ -245,7 +261,7 @@ def material_case(
     }
 
 
-cases(
+register_cases(
     "materials",
     check_scene,
     [
@@ -274,7 +290,7 @@ cases(
 )
 
 
-@case("materials", "clear-glass", slow=True)
+@register_case("materials", "clear-glass", slow=True)
 def look_through_glass() -> Outcome:
     """A texel behind clear glass has the right gradient, and nothing is NaN."""
     controls: ControlSettings = {
@@ -286,38 +302,44 @@ def look_through_glass() -> Outcome:
     )
 
 
-@case("materials", "texels-0-and-1")
+@register_case("materials", "texels-0-and-1")
 def texels_at_the_ends() -> Outcome:
     """Texels at the ends of the range have a gradient, and the search moves them
     inwards only.
     """
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
     renderer = make_renderer(controls, make_checkered_mug)
-    raw = renderer.like(transfer="linear")
+    raw = renderer.copy_with(transfer="linear")
     start = renderer.start
-    loss = gradients.smooth_loss(raw.formation.resolution)
+    loss = gradients.make_smooth_loss(raw.formation.resolution)
     slope = torch.stack(
         [raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]
     ).mean(dim=0)
     gradient, expected = measure_inward_slope(renderer, slope, 1.0, 8, REFERENCE_SPP)
     error = abs(gradient / expected - 1.0)
     best = run_search(renderer, loss, 3).best_u
-    return check_scene(controls, make_checkered_mug, compare=False).also(
-        check(
-            "gradient error along a direction that points inwards", error, most=ERROR
+    return check_scene(controls, make_checkered_mug, compare=False).with_checks(
+        check_range(
+            "gradient error along a direction that points inwards",
+            error,
+            most=MAX_GRADIENT_ERROR,
         ),
-        check(
+        check_range(
             "smallest texel of the adversarial configuration",
             float(best.min()),
             least=0.0,
         ),
-        check(
+        check_range(
             "largest texel of the adversarial configuration",
             float(best.max()),
             most=1.0,
         ),
-        check("texels that the search moved", float((best != start).sum()), least=1.0),
-        holds("the start has both 0 and 1", set(start.tolist()) == {0.0, 1.0}),
+        check_range(
+            "texels that the search moved", float((best != start).sum()), least=1.0
+        ),
+        check_condition(
+            "the start has both 0 and 1", set(start.tolist()) == {0.0, 1.0}
+        ),
         relative_error=error,
     )
 
@@ -337,7 +359,7 @@ def projector_case(
     return {"controls": controls, "u": u, "compare": False, "gradient": (1e-12, None)}
 
 
-cases(
+register_cases(
     "light",
     check_scene,
     [
@@ -395,7 +417,7 @@ cases(
 )
 
 
-@case("light", "projector-through-glass")
+@register_case("light", "projector-through-glass")
 def project_through_glass() -> Outcome:
     """Light that meets glass on its way leaves picture and gradient finite."""
     arguments = projector_case(azimuth=describe_mug().number("camera.azimuth"))
@@ -412,27 +434,32 @@ LINE = [[0.0, 0.0, 0.5], [0.0, 0.1, 0.5], [0.0, 0.2, 0.5]]
 DEGENERATE = make_checkered_object(
     make_mesh(QUAD + LINE, [*HALVES, [0, 0, 1], [4, 5, 6], [4, 4, 4]])
 )
-TWICE = make_checkered_object(make_mesh(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]]))
+COINCIDENT_SQUARES = make_checkered_object(
+    make_mesh(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]])
+)
 THIN = [[0.0, -0.5, 0.5], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5 + 1e-6]]
 SLIVER = make_checkered_object(make_mesh(QUAD + THIN, [*HALVES, [4, 5, 6]]))
 TRIANGLE = make_checkered_object(
     make_mesh([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]])
 )
-FRONT = {"camera.azimuth": 0.0, "camera.elevation": 10.0}
-PAINTED: ControlSettings = {"texture": {"resolution": 8}, "pose": {"y": [-0.3, 0.3]}}
+FRONT_VIEW = {"camera.azimuth": 0.0, "camera.elevation": 10.0}
+TEXTURED_MOVE: ControlSettings = {
+    "texture": {"resolution": 8},
+    "pose": {"y": [-0.3, 0.3]},
+}
 SHIFT: ControlSettings = {"pose": {"x": [-0.3, 0.3]}}
 # settings without the ground, so that a dark object has an outline and nothing else
-BARE = {"ground.size": 0.0}
+NO_GROUND = {"ground.size": 0.0}
 
 
 def mesh_case(
     thing: assets.ObjectAsset, beside: assets.ObjectAsset | None = None
 ) -> dict[str, object]:
-    other = {"beside": {"thing": beside, "settings": FRONT}} if beside else {}
+    other = {"beside": {"thing": beside, "settings": FRONT_VIEW}} if beside else {}
     return {
-        "controls": PAINTED,
+        "controls": TEXTURED_MOVE,
         "thing": thing,
-        "settings": FRONT,
+        "settings": FRONT_VIEW,
         "slow": True,
         **other,
     }
@@ -471,11 +498,16 @@ def file_case(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
 
 
 def outline_case(controls: ControlSettings) -> dict[str, object]:
-    return {"controls": controls, "thing": make_dark_mug, "settings": BARE, "u": [0.5]}
+    return {
+        "controls": controls,
+        "thing": make_dark_mug,
+        "settings": NO_GROUND,
+        "u": [0.5],
+    }
 
 
 EMPTY_VIEW = {"controls": {"pose": {"z": [-3.0, -2.0]}}, "settings": {"pose.x": 9e3}}
-cases(
+register_cases(
     "geometry",
     check_scene,
     [
@@ -493,7 +525,7 @@ cases(
         (
             "coincident-faces",
             "Two faces in one place look like one.",
-            mesh_case(TWICE, SQUARE),
+            mesh_case(COINCIDENT_SQUARES, SQUARE),
         ),
         ("one-triangle", "Finite, and both gradients are right.", mesh_case(TRIANGLE)),
         (
@@ -573,11 +605,11 @@ cases(
 )
 
 
-@case("geometry", "million-triangles", slow=True)
+@register_case("geometry", "million-triangles", slow=True)
 def million() -> Outcome:
     """Finite, right, and like the coarse mesh of the same shape."""
     fine_mesh, coarse_mesh = (
-        assets.normalised(workbench.sphere(*counts))
+        assets.normalise_mesh(workbench.make_sphere(*counts))
         for counts in ((501, 1000), (64, 128))
     )
     coarse, renderer = (
@@ -585,20 +617,31 @@ def million() -> Outcome:
         for made in (coarse_mesh, fine_mesh)
     )
     _, slope = renderer.gradient(
-        gradients.smooth_loss(renderer.formation.resolution), renderer.start, 0, SPP
+        gradients.make_smooth_loss(renderer.formation.resolution),
+        renderer.start,
+        0,
+        SPP,
     )
     difference = mean_difference(
         render_image(renderer, renderer.start, 0, 64),
         render_image(coarse, coarse.start, 0, 64),
     )
-    return check_scene(TEXTURE, make_checkered_object(fine_mesh), evaluations=2).also(
-        check("triangles", float(len(fine_mesh.faces)), least=1e6),
-        holds("the gradient by a shift is finite", bool(torch.isfinite(slope).all())),
-        check("mean difference from a sphere of 16,000", difference, most=SAME_PICTURE),
+    return check_scene(
+        TEXTURE, make_checkered_object(fine_mesh), evaluations=2
+    ).with_checks(
+        check_range("triangles", float(len(fine_mesh.faces)), least=1e6),
+        check_condition(
+            "the gradient by a shift is finite", bool(torch.isfinite(slope).all())
+        ),
+        check_range(
+            "mean difference from a sphere of 16,000",
+            difference,
+            most=MAX_PICTURE_DIFFERENCE,
+        ),
     )
 
 
-@case("geometry", "gimbal-angles", slow=True)
+@register_case("geometry", "gimbal-angles", slow=True)
 def gimbal() -> Outcome:
     """At a pitch of 90 degrees the gradients by angles and by the rotation vector are
     right.
@@ -611,26 +654,28 @@ def gimbal() -> Outcome:
             "on_ground": "no",
         }
     }
-    locked = make_renderer(angles, make_dark_mug, settings=BARE)
+    locked = make_renderer(angles, make_dark_mug, settings=NO_GROUND)
     # yaw 36 is roll -36 here
     yaw, roll = (
         render_image(locked, torch.tensor(u))
         for u in ([0.7, 0.5, 0.5], [0.5, 0.5, 0.3])
     )
     rotation = {"pose": {"rotation": [-90.0, 90.0], "pitch": 90.0, "on_ground": "no"}}
-    free = make_renderer(rotation, make_dark_mug, settings=BARE)
+    free = make_renderer(rotation, make_dark_mug, settings=NO_GROUND)
     worst = max(
         row.excess for row in compare_gradient(free, free.start + 0.1, seeds=(3, 5))
     )
     return check_scene(
-        angles, make_dark_mug, settings=BARE, u=[0.7, 0.5, 0.5], spp=2 * SPP
-    ).also(
-        check(
+        angles, make_dark_mug, settings=NO_GROUND, u=[0.7, 0.5, 0.5], spp=2 * SPP
+    ).with_checks(
+        check_range(
             "mean difference of yaw 36 and roll -36",
             mean_difference(yaw, roll),
-            most=SAME_PICTURE,
+            most=MAX_PICTURE_DIFFERENCE,
         ),
-        check("gradient error of the rotation vector", worst, most=ERROR),
+        check_range(
+            "gradient error of the rotation vector", worst, most=MAX_GRADIENT_ERROR
+        ),
     )
 
 
@@ -639,25 +684,29 @@ def full_turn(controls: ControlSettings) -> Outcome:
     renderer = make_renderer(controls)
     zero = torch.zeros_like(renderer.start)
     one = torch.ones_like(renderer.start)
-    loss = gradients.smooth_loss(renderer.formation.resolution)
+    loss = gradients.make_smooth_loss(renderer.formation.resolution)
     slopes = [renderer.gradient(loss, u, 0, SPP)[1] for u in (zero, one)]
     difference = mean_difference(
         render_image(renderer, zero), render_image(renderer, one)
     )
     wrapped_u = float(make_domain(renderer).project(one + 0.01).max())
     size = float(slopes[0].abs().max())
-    return check_scene(controls, u=[0.0], compare=False).also(
-        check("mean difference of the pictures", difference, most=SAME_PICTURE),
-        check(
+    return check_scene(controls, u=[0.0], compare=False).with_checks(
+        check_range(
+            "mean difference of the pictures", difference, most=MAX_PICTURE_DIFFERENCE
+        ),
+        check_range(
             "difference of the gradients",
             float((slopes[0] - slopes[1]).abs().max()) / size,
             most=0.05,
         ),
-        check("where a step of 0.01 past the end goes", wrapped_u, 0.0099, 0.0101),
+        check_range(
+            "where a step of 0.01 past the end goes", wrapped_u, 0.0099, 0.0101
+        ),
     )
 
 
-TURN = (
+FULL_TURN = (
     "0 and 360 degrees give one picture and one gradient, and a step goes on "
     "across "
     "the seam."
@@ -668,10 +717,10 @@ for control, name in (
     ("environment", "rotation"),
 ):
     controls: ControlSettings = {control: {name: [0.0, 360.0]}}
-    cases(
+    register_cases(
         "geometry",
         full_turn,
-        [(f"full-turn-{control}-{name}", TURN, {"controls": controls})],
+        [(f"full-turn-{control}-{name}", FULL_TURN, {"controls": controls})],
     )
 
 
@@ -683,12 +732,14 @@ def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
 
     The result of a case is stored at once: a resumed run continues with the next.
     """
-    cases = chosen(context.config.cases, context.config.groups)
+    cases = select_cases(context.config.cases, context.config.groups)
     measurements = context.open_measurements(context.config.seconds)
     progress = context.progress
 
     def measure_rows() -> Iterator[CaseRow]:
-        hint = "`case` and `group` pick some, `seconds` stops before the next one"
+        hint = (
+            "`register_case` and `group` pick some, `seconds` stops before the next one"
+        )
         progress.stage("trying stiff and extreme scenes", len(cases), hint=hint)
         for planned in cases:
             is_stored = measurements.stored(planned.name) is not None
@@ -710,10 +761,10 @@ def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
 
 def sentences() -> dict[str, str]:
     """Return group and what must hold of each case by name."""
-    return {case.name: f"{case.group}: {case.holds}" for case in CASES}
+    return {case.name: f"{case.group}: {case.holds}" for case in ALL_CASES}
 
 
-def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
+def select_cases(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
     """Select the cases of names and groups, all if neither is given.
 
     Raises:
@@ -723,13 +774,13 @@ def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
         ("case", "name", names),
         ("group", "group", groups),
     ):
-        known = dict.fromkeys(getattr(each, attribute) for each in CASES)
+        known = dict.fromkeys(getattr(each, attribute) for each in ALL_CASES)
         for name in requested:
             if name not in known:
                 raise errors.UnknownNameError(kind, name, known)
     if not names and not groups:
-        return list(CASES)
-    return [each for each in CASES if each.name in names or each.group in groups]
+        return list(ALL_CASES)
+    return [each for each in ALL_CASES if each.name in names or each.group in groups]
 
 
 # ---- Controls whose scales differ by a million, and noise
@@ -741,7 +792,7 @@ def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
 RATIO = 1e6
 
 
-def hessian(
+def estimate_hessian(
     value: Callable[[Tensor], float],
     u: Tensor,
     directions: Tensor,
@@ -782,25 +833,29 @@ def condition_number(second: Tensor) -> float:
     return float(sizes.max() / sizes.min())
 
 
-@case("stiff", "badly-scaled-range")
+@register_case("stiff", "badly-scaled-range")
 def wide_range() -> Outcome:
     """The derivative does not depend on how wide the searched range is."""
     wide, narrow = ({"pose": {"x": [-reach, reach]}} for reach in (1e4, 0.3))
     slopes = []
     for controls, width in ((wide, 2e4), (narrow, 0.6)):
         renderer = make_renderer(controls)
-        loss = gradients.smooth_loss(renderer.formation.resolution)
+        loss = gradients.make_smooth_loss(renderer.formation.resolution)
         derivatives = [
             float(renderer.gradient(loss, renderer.start, seed, 32)[1][0])
             for seed in range(6)
         ]
         slopes.append(statistics.fmean(derivatives) / width)
     error = abs(slopes[0] / slopes[1] - 1.0)
-    error_check = check("error of the derivative per object size", error, most=0.2)
-    return check_scene(wide, compare=False).also(error_check, relative_error=error)
+    error_check = check_range(
+        "error of the derivative per object size", error, most=0.2
+    )
+    return check_scene(wide, compare=False).with_checks(
+        error_check, relative_error=error
+    )
 
 
-@case("stiff", "light-rotation-texel", slow=True)
+@register_case("stiff", "light-rotation-texel", slow=True)
 def light_rotation_texel() -> Outcome:
     """All three move, the condition number is printed, and the objective's unit does
     not matter.
@@ -821,11 +876,11 @@ def light_rotation_texel() -> Outcome:
     scaled_path, ending = _record_path(renderer, u, RATIO)
     distances = (path - path[0]).abs().amax(dim=0)
     path_difference = float((path - scaled_path).abs().max())
-    return check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False).also(
-        check("how far the power moved", float(distances[0]), least=0.05),
-        check("how far the rotation moved", float(distances[1]), least=0.05),
-        check("how far the texels moved", float(distances[2:].max()), least=0.05),
-        check(
+    return check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False).with_checks(
+        check_range("how far the power moved", float(distances[0]), least=0.05),
+        check_range("how far the rotation moved", float(distances[1]), least=0.05),
+        check_range("how far the texels moved", float(distances[2:].max()), least=0.05),
+        check_range(
             "distance from the path of the objective x 1e6", path_difference, most=1e-3
         ),
         ending=ending,
@@ -840,14 +895,14 @@ def light_rotation_texel() -> Outcome:
 
 def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tensor:
     """Return second derivatives (3, 3) by power, rotation, and all texels at once."""
-    loss = gradients.smooth_loss(renderer.formation.resolution)
+    loss = gradients.make_smooth_loss(renderer.formation.resolution)
     directions = torch.zeros(3, len(u))
     directions[0, 0] = 1.0
     directions[1, 1] = 1.0
     directions[2, 2:] = 1.0
     steps = [0.2, renderer.plan.groups[1].step * 2.0, 0.08]
-    return hessian(
-        lambda at: SHARPNESS * float(loss(render_image(renderer, at, 0, 64))),
+    return estimate_hessian(
+        lambda at: LOGIT_SCALE * float(loss(render_image(renderer, at, 0, 64))),
         u,
         directions,
         steps,
@@ -858,7 +913,7 @@ def _record_path(
     renderer: gradients.Renderer, u: Tensor, scale: float
 ) -> tuple[Tensor, str]:
     """Search with a scaled objective; return the path (steps, d) and the status."""
-    loss = gradients.smooth_loss(renderer.formation.resolution)
+    loss = gradients.make_smooth_loss(renderer.formation.resolution)
     path: list[Tensor] = []
     result = run_search(
         renderer,
@@ -876,7 +931,7 @@ MIXED = {
     "environment": {"exposure": [-1.0, 1.0]},
     "pose": {"y": [-0.3, 0.3]},
 }
-cases(
+register_cases(
     "noise",
     check_scene,
     [
@@ -899,7 +954,7 @@ cases(
 )
 
 
-@case("noise", "heavy-tails-of-a-moving-mesh", slow=True)
+@register_case("noise", "heavy-tails-of-a-moving-mesh", slow=True)
 def heavy_render(count: int = 24) -> Outcome:
     """The plan takes differences of the loss for what moves a mesh, which have no heavy
     tail.
@@ -908,18 +963,20 @@ def heavy_render(count: int = 24) -> Outcome:
     median than 12 median distances.
     """
     controls = {"pose": {"x": [-0.3, 0.3]}}
-    renderer = make_renderer(controls).like(transfer="linear")
-    renderer.plan = renderer.plan.at_a_pixel()
-    loss = gradients.smooth_loss(renderer.formation.resolution)
+    renderer = make_renderer(controls).copy_with(transfer="linear")
+    renderer.plan = renderer.plan.with_pixel_steps()
+    loss = gradients.make_smooth_loss(renderer.formation.resolution)
     slopes = torch.stack(
         [renderer.gradient(loss, renderer.start, seed, 4)[1] for seed in range(count)]
     ).double()
     distance = (slopes - slopes.median()).abs()
-    return check_scene(controls, compare=False, spp=4).also(
-        check(
+    return check_scene(controls, compare=False, spp=4).with_checks(
+        check_range(
             "farthest over the median distance",
             float(distance.max() / distance.median()),
             most=12.0,
         ),
-        holds("the plan takes secant", renderer.plan.groups[0].estimator == "secant"),
+        check_condition(
+            "the plan takes secant", renderer.plan.groups[0].estimator == "secant"
+        ),
     )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from advsearch.experiment import RunContext, experiment
-from advsearch.questions.sweep.display import claims, shown
-from advsearch.questions.sweep.page import page
+from advsearch.questions.sweep.display import make_sweep_claims, make_sweep_view
+from advsearch.questions.sweep.page import make_page
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 
@@ -17,11 +17,11 @@ from advsearch.questions.sweep.summary import SweepSummary
     "sweep --object mug --control pose --samples 200 --surface",
     "sweep --adversarial-of mug-texture-001 --control camera,environment --samples 200",
     about="adversarial_of",
-    defaults_from_run=SweepConfig.of_attack,
+    defaults_from_run=SweepConfig.load_attack_defaults,
     python_function="advsearch.questions.sweep.carry_out:sweep",
-    view=shown,
-    claims=claims,
-    page=page,
+    view=make_sweep_view,
+    claims=make_sweep_claims,
+    page=make_page,
 )
 def sweep(context: RunContext[SweepConfig]) -> SweepSummary:
     """Measure how often the model is right."""

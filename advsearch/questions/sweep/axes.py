@@ -25,12 +25,12 @@ from torch import Tensor
 
 from advsearch import controls as families
 from advsearch.attacks import Block, Domain
-from advsearch.attacks.domain import Draws, Product
+from advsearch.attacks.domain import ProductIndex, SampleSequence
 from advsearch.controls import CONTROLS, Control, Parameter, Space
 from advsearch.controls.base import Value
-from advsearch.controls.ranges import Fixed, Number, OneOf, Range, read
+from advsearch.controls.ranges import Fixed, OneOf, ParameterValue, Range, parse_spec
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.options import BY_KEY
+from advsearch.options import MITSUBA_CONTROL
 from advsearch.runs.results import VariedValue
 from advsearch.runs.tables import Units
 from advsearch.scene.description import ENVIRONMENT, SceneDescription
@@ -71,7 +71,7 @@ class Axis:
     control: str
     instance: str
     parameter: Parameter
-    values: tuple[Number, ...]
+    values: tuple[ParameterValue, ...]
 
     @property
     def name(self) -> str:
@@ -88,7 +88,7 @@ class Axis:
         return _stored_unit(self.parameter)
 
 
-def read_axes(
+def parse_axes(
     grid: Mapping[str, object], controls: Sequence[Control]
 ) -> tuple[Axis, ...]:
     """Parse the axes of a grid.
@@ -123,7 +123,7 @@ def read_axes(
 
 
 def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axis:
-    """Parse one axis; see `read_axes`.
+    """Parse one axis; see `parse_axes`.
 
     Args:
         name: of the parameter.
@@ -139,7 +139,7 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
     if control_name in instances:
         instance = control_name
     else:
-        instance = families.instance_of(kind, suffix or prefix)
+        instance = families.make_instance_name(kind, suffix or prefix)
     if control_name in _LISTED_SETTINGS and not dot:
         raise InputError(
             f"{where}: several of them are given as a list: "
@@ -153,20 +153,20 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
             f"It stands in {where}; write `grid` CONTROL.PARAMETER=VALUES, such as "
             "pose.yaw=0:360:24."
         )
-        raise families.unknown_control(kind, hint, instances)
-    if kind == BY_KEY:
+        raise families.make_unknown_control_error(kind, hint, instances)
+    if kind == MITSUBA_CONTROL:
         return _parse_key_axis(name, values, control)
 
     declared = [*control.declared({parameter_name: values})]
     if instance in instances:
-        declared += instances[instance].own
+        declared += instances[instance].instance_parameters
     parameters = {parameter.name: parameter for parameter in declared}
     if not parameter_name:
         raise InputError(
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
             f"choose one of {', '.join(parameters)}"
         )
-    families.check_instance(where, suffix or prefix, colon or prefix_colon)
+    families.check_instance_name(where, suffix or prefix, colon or prefix_colon)
     if parameter_name not in parameters:
         raise UnknownNameError(
             f"parameter of control {control.kind}",
@@ -176,7 +176,7 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         )
     parameter = parameters[parameter_name]
     _check_scalar(where, control, parameter, instance)
-    parsed_values = axis_values(where, parameter, values)
+    parsed_values = parse_axis_values(where, parameter, values)
     return Axis(control.kind, instance, parameter, parsed_values)
 
 
@@ -190,10 +190,15 @@ def _parse_key_axis(name: str, values: Any, control: Any) -> Axis:
     if not key:
         raise InputError(
             f"{where}: expected Mitsuba's name and values, as in "
-            f"{BY_KEY}:KEY=FIRST:LAST:COUNT"
+            f"{MITSUBA_CONTROL}:KEY=FIRST:LAST:COUNT"
         )
     (parameter,) = control.declared([key])
-    return Axis(BY_KEY, BY_KEY, parameter, axis_values(where, parameter, values))
+    return Axis(
+        MITSUBA_CONTROL,
+        MITSUBA_CONTROL,
+        parameter,
+        parse_axis_values(where, parameter, values),
+    )
 
 
 def _check_scalar(
@@ -209,9 +214,9 @@ def _check_scalar(
         )
 
 
-def axis_values(
+def parse_axis_values(
     where: str, parameter: Parameter, raw_values: Any
-) -> tuple[Number, ...]:
+) -> tuple[ParameterValue, ...]:
     """Parse and check the values of an axis.
 
     ``"FIRST:LAST:COUNT"`` is COUNT values evenly spaced from FIRST to LAST, both
@@ -239,7 +244,7 @@ def axis_values(
         )
     _check_count(where, len(values))
     choices = [value.item() if hasattr(value, "item") else value for value in values]
-    spec = read(where, parameter, {"choices": choices})
+    spec = parse_spec(where, parameter, {"choices": choices})
     assert isinstance(spec, OneOf)
     _check_different(where, spec.values, is_angle)
     has_names = any(isinstance(value, str) for value in spec.values)
@@ -248,9 +253,11 @@ def axis_values(
     return spec.values
 
 
-def _check_different(where: str, values: Sequence[Number], is_angle: bool) -> None:
+def _check_different(
+    where: str, values: Sequence[ParameterValue], is_angle: bool
+) -> None:
     """Check that no value comes twice, and no angle in two forms."""
-    first_values: dict[Number, Number] = {}
+    first_values: dict[ParameterValue, ParameterValue] = {}
     for value in values:
         key = value
         if is_angle and not isinstance(value, str):
@@ -280,12 +287,12 @@ def _check_single_precision(where: str, values: Sequence[Any]) -> None:
         )
 
 
-def _format_value(value: Number) -> str:
+def _format_value(value: ParameterValue) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
 
 def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
-    """Return the values of ``FIRST:LAST:COUNT``; see `axis_values`."""
+    """Return the values of ``FIRST:LAST:COUNT``; see `parse_axis_values`."""
     expected = (
         f"{where}: expected FIRST:LAST:COUNT such as 0:360:24, or values "
         f"separated by commas, got {text!r}"
@@ -337,7 +344,7 @@ def _check_count(where: str, count: int) -> None:
         )
 
 
-def on_grid(
+def add_grid_axes(
     controls: Sequence[Control], axes: Sequence[Axis], scene: SceneDescription
 ) -> tuple[Control, ...]:
     """Return the controls with the axes among their parameters as discrete choices.
@@ -368,14 +375,14 @@ def on_grid(
 
 def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, object]:
     """Return the settings of a sampled control, with its default ranges spelled out."""
-    settings = control.settings()
+    settings = control.to_settings()
     settings = {
         name: value for name, value in settings.items() if name not in ("kind", "name")
     }
-    if control.asked:
+    if control.has_requested_search:
         # Ranges were set, so that its other parameters have no default range.
         return settings
-    in_scene = control.within(scene).in_scene
+    in_scene = control.with_scene(scene).resolve_parameter
     for parameter in map(in_scene, control.parameters):
         if parameter.name in control.specs or parameter.search is None:
             continue
@@ -387,7 +394,7 @@ def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, ob
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SampledNumber:
     """A sampled number, as the table shows it.
 
     Attributes:
@@ -396,8 +403,8 @@ class Drawn:
         column: its index among the draws.
         parts: what equal parts of [0, 1] stand for: bounds of a range each, or values
             of a list.
-        settled: whether `parts` are the same in every scene.
-        shares: the part that each of more equal shares of [0, 1] stands for, where
+        same_in_all_scenes: whether `parts` are the same in every scene.
+        part_of_share: the part that each of more equal shares of [0, 1] stands for, where
             values have weights.
     """
 
@@ -405,11 +412,11 @@ class Drawn:
     unit: str
     column: int
     parts: tuple[Any, ...]
-    settled: bool = True
-    shares: tuple[int, ...] = ()
+    same_in_all_scenes: bool = True
+    part_of_share: tuple[int, ...] = ()
 
     @property
-    def varied(self) -> VariedValue:
+    def varied_value(self) -> VariedValue:
         """What the value was sampled from, as a result has it."""
         bounds = [
             bound for part in self.parts if isinstance(part, list) for bound in part
@@ -421,12 +428,14 @@ class Drawn:
     @property
     def edges(self) -> list[float] | None:
         """The bounds of the parts, ascending; None of a list."""
-        if not self.settled or not all(isinstance(part, list) for part in self.parts):
+        if not self.same_in_all_scenes or not all(
+            isinstance(part, list) for part in self.parts
+        ):
             return None
         return sorted({bound for part in self.parts for bound in part})
 
 
-def parts_of_ranges(n_images: int) -> int:
+def choose_n_parts(n_images: int) -> int:
     """Return into how many parts tables and figures cut the range of a parameter.
 
     Args:
@@ -481,10 +490,10 @@ class Points:
 
     Attributes:
         count: images of the scene.
-        parts: into which tables cut the range of each sampled number.
-        drawn: the sampled numbers that tables show.
-        drawn_numbers: which numbers are sampled; the same for all scenes.
-        draws: whether anything is sampled: a control may have all its values from the
+        n_parts: into which tables cut the range of each sampled number.
+        sampled_numbers: the sampled numbers that tables show.
+        sampled_layout: which numbers are sampled; the same for all scenes.
+        is_sampled: whether anything is sampled: a control may have all its values from the
             grid, as a path its time.
         units: how rows follow from draws.
     """
@@ -497,13 +506,13 @@ class Points:
         samples: int,
         sampler: str,
         seed: int,
-        scenes: int = 0,
-        among: int = 1,
+        repeat_after_scenes: int = 0,
+        n_scenes: int = 1,
     ) -> None:
-        self.grid = Product(tuple(len(axis.values) for axis in axes))
+        self.grid = ProductIndex(tuple(len(axis.values) for axis in axes))
         self.samples = samples
         self.count = self.grid.count * samples
-        self.parts = parts_of_ranges(self.count * among)
+        self.n_parts = choose_n_parts(self.count * n_scenes)
         self.space = space
         self._start = domain.start.numpy().astype(np.float64)
         self._lower = domain.lower.numpy()
@@ -512,38 +521,43 @@ class Points:
         self._grid_coordinates: list[_GridCoordinate] = []
         self._small_blocks: list[_SampledBlock] = []
         self._large_blocks: list[_SampledBlock] = []
-        self.drawn = tuple(self._assign_blocks(domain))
-        self._columns = [number.column for number in self.drawn]
-        n_shares = [len(number.shares or number.parts) for number in self.drawn]
+        self.sampled_numbers = tuple(self._assign_blocks(domain))
+        self._columns = [number.column for number in self.sampled_numbers]
+        n_shares = [
+            len(number.part_of_share or number.parts) for number in self.sampled_numbers
+        ]
         self._n_shares = np.array(n_shares, dtype=np.int64)
 
         small_dimensions = _count_columns(self._small_blocks)
         large_dimensions = _count_columns(self._large_blocks)
-        self._small_draws = Draws(small_dimensions, sampler, seed)
-        self._large_draws = Draws(large_dimensions, "random", seed, "large draws")
-        self.draws = small_dimensions + large_dimensions > 0
+        self._small_draws = SampleSequence(small_dimensions, sampler, seed)
+        self._large_draws = SampleSequence(
+            large_dimensions, "random", seed, "large draws"
+        )
+        self.is_sampled = small_dimensions + large_dimensions > 0
         # Samples are draws, or differ in noise alone if nothing is sampled.
         self.units = Units(
             self.grid.sizes,
             next((index for index, axis in enumerate(axes) if axis.is_time), None),
-            samples if self.draws else 1,
-            again=scenes * self.count,
-            noise=1 if self.draws else samples,
+            samples if self.is_sampled else 1,
+            again=repeat_after_scenes * self.count,
+            noise=1 if self.is_sampled else samples,
         )
         numbers = tuple(
-            (number.name, number.column, len(number.parts)) for number in self.drawn
+            (number.name, number.column, len(number.parts))
+            for number in self.sampled_numbers
         )
-        self.drawn_numbers = (small_dimensions, numbers)
+        self.sampled_layout = (small_dimensions, numbers)
         self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
 
-    def _assign_blocks(self, domain: Domain) -> Iterator[Drawn]:
+    def _assign_blocks(self, domain: Domain) -> Iterator[SampledNumber]:
         """Assign each block to the grid, or to columns of the draws.
 
         Yields the sampled numbers that tables show.
         """
         controls = {control.name: control for control in self.space.controls}
         for group, (block, coordinates) in zip(
-            self.space.groups, domain.parts(), strict=True
+            self.space.groups, domain.list_block_slices(), strict=True
         ):
             if group.name in self._axes:
                 axis_index, _ = self._axes[group.name]
@@ -567,7 +581,7 @@ class Points:
 
     def _describe_sampled(
         self, control: Control, name: str, coordinates: slice, begin: int
-    ) -> Iterator[Drawn]:
+    ) -> Iterator[SampledNumber]:
         """Yield the sampled numbers of a parameter, as tables show them.
 
         Args:
@@ -583,27 +597,27 @@ class Points:
             shares: tuple[int, ...] = ()
             if values != spec.values:  # a value with a weight comes several times
                 shares = tuple(map(values.index, spec.values))
-            yield Drawn(
-                full_name, _stored_unit(parameter), begin, values, shares=shares
+            yield SampledNumber(
+                full_name, _stored_unit(parameter), begin, values, part_of_share=shares
             )
             return
         for component, column in enumerate(range(coordinates.start, coordinates.stop)):
             edges = torch.linspace(
                 float(self._lower[column]),
                 float(self._upper[column]),
-                self.parts + 1,
+                self.n_parts + 1,
                 dtype=torch.float64,
             )
-            edge_values = spec.at(edges, log=parameter.log).tolist()
+            edge_values = spec.interpolate(edges, log=parameter.log).tolist()
             suffix = f".{component}" if parameter.shape else ""
-            yield Drawn(
+            yield SampledNumber(
                 full_name + suffix,
                 parameter.unit,
                 begin + component,
                 tuple(map(list, pairwise(edge_values))),
             )
 
-    def parts_of(self, first: int, count: int) -> NDArray[np.int64]:
+    def find_parts(self, first: int, count: int) -> NDArray[np.int64]:
         """Return the part of each of k sampled numbers that images lie in.
 
         Args:
@@ -616,16 +630,16 @@ class Points:
         draws = self._sample(self._small_draws, first, count)
         shares = (draws[:, self._columns] * self._n_shares).astype(np.int64)
         parts = np.minimum(shares, self._n_shares - 1)
-        for column, number in enumerate(self.drawn):
-            if number.shares:
-                parts[:, column] = np.take(number.shares, parts[:, column])
+        for column, number in enumerate(self.sampled_numbers):
+            if number.part_of_share:
+                parts[:, column] = np.take(number.part_of_share, parts[:, column])
         return parts
 
-    def noise(self, number: int) -> int:
+    def noise_number(self, number: int) -> int:
         """Return the number of the noise of an image, by its number in the sweep."""
         return number % self.units.again if self.units.again else number
 
-    def _sample(self, draws: Draws, first: int, count: int) -> Float64Array:
+    def _sample(self, draws: SampleSequence, first: int, count: int) -> Float64Array:
         """Return the draws (count, k) of neighbouring images.
 
         Args:
@@ -653,7 +667,7 @@ class Points:
         grid_points = np.arange(first, first + count) // self.samples
         return np.unravel_index(grid_points, self.grid.sizes)
 
-    def configurations(self, first: int, count: int, before: int = 0) -> Tensor:
+    def make_configurations(self, first: int, count: int, before: int = 0) -> Tensor:
         """Return the configurations (count, d) float32 of neighbouring images.
 
         Args:
@@ -710,7 +724,7 @@ class Points:
         varies = any(group.setting == ENVIRONMENT for group in self.space.groups)
         return None if varies else self.space.environment
 
-    def values(self, u: Tensor, first: int) -> list[dict[str, Value]]:
+    def describe_images(self, u: Tensor, first_image: int) -> list[dict[str, Value]]:
         """Return the stored values of neighbouring images: parameter to value and unit.
 
         As `Space.describe` returns them, except that a parameter of the grid has the
@@ -718,10 +732,10 @@ class Points:
 
         Args:
             u: (n, d) configurations.
-            first: number of the first image in the scene.
+            first_image: number of the first image in the scene.
         """
         rows = [dict[str, Value]() for _ in u]
-        indices = self._axis_indices(first, len(u))
+        indices = self._axis_indices(first_image, len(u))
         coordinates = u.split(self.space.sizes, dim=1)
         for control, control_u in zip(self.space.controls, coordinates, strict=True):
             if _is_described_by_base(control):
@@ -810,7 +824,11 @@ class Points:
                     yield name, unit, _select_options(spec, column)
                     continue
                 suffix = f".{component}" if parameter.shape else ""
-                yield name + suffix, unit, spec.at(column, log=parameter.log).tolist()
+                yield (
+                    name + suffix,
+                    unit,
+                    spec.interpolate(column, log=parameter.log).tolist(),
+                )
 
 
 def _select_options(spec: OneOf, column: Tensor) -> list[Any]:

@@ -10,31 +10,36 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from advsearch.api.keywords import SceneKeywords, asks
-from advsearch.cluster import Call
+from advsearch.api.keywords import SceneKeywords, with_settings_signature
+from advsearch.cluster import BatchFunction
 from advsearch.controls import Control
-from advsearch.controls.camera import CameraControl, measured_in
+from advsearch.controls.camera import CameraControl, adapt_length_unit
 from advsearch.engine import judging, loading, naming
-from advsearch.engine.journal import check_made_of, worker_call
+from advsearch.engine.journal import check_digests, make_worker_call
 from advsearch.engine.judging import Metric, load_metrics
 from advsearch.engine.loading import Controls, Scene, load_scene
-from advsearch.engine.naming import AnyModel, given_to, load_models, model_name
+from advsearch.engine.naming import (
+    AnyModel,
+    get_model_name,
+    load_models,
+    make_configured_controls,
+)
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
-from advsearch.options import as_setting
+from advsearch.options import to_setting
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.attack.carry_out import LOADING, executor_for, is_named
+from advsearch.questions.attack.carry_out import LOADING, is_named, open_executor
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import attack_of
-from advsearch.questions.sweep.axes import Axis, on_grid, read_axes
-from advsearch.questions.sweep.drives import with_frames
+from advsearch.questions.attack.summary import load_attack_summary
+from advsearch.questions.sweep.axes import Axis, add_grid_axes, parse_axes
+from advsearch.questions.sweep.drives import add_frames
 from advsearch.questions.sweep.job import (
     Job,
     NamedScene,
-    OpenScenes,
-    check_all,
+    SceneLoader,
+    check_job,
     check_scenes,
 )
 from advsearch.questions.sweep.loop import Sweep
@@ -53,11 +58,11 @@ from advsearch.runs.directory import (
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_configuration
 from advsearch.scene.description import ENVIRONMENT
-from advsearch.scene.formation import aovs_of
-from advsearch.scene.things import ALL
+from advsearch.scene.formation import parse_aovs
+from advsearch.scene.things import ALL_THINGS
 from advsearch.settings import PythonOnly, split_names
-from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
-from advsearch.tasks.together import each_thing
+from advsearch.tasks import AnyTask, FunctionTask, Task, get_task_function, make_task
+from advsearch.tasks.together import make_each_thing_task
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -95,7 +100,7 @@ class SweepKeywords(SceneKeywords, total=False):
     trials: int
 
 
-@asks(SweepConfig)
+@with_settings_signature(SweepConfig)
 def sweep(
     scene: AnyScene | Sequence[AnyScene] | None = None,
     model: AnyModel | Sequence[AnyModel] | None = None,
@@ -164,28 +169,28 @@ def sweep(
         name: value for name, value in settings.items() if value is not None
     }
     described: dict[str, object] = {
-        "model": ",".join(model_name(network) for network in networks),
-        "task": as_setting(task) if isinstance(task, Task) else task,
-        "controls": loading.settings_of(controls),
+        "model": ",".join(get_model_name(network) for network in networks),
+        "task": to_setting(task) if isinstance(task, Task) else task,
+        "controls": loading.controls_to_settings(controls),
         "grid": dict(grid or {}),
         "samples": samples,
         "adversarial_of": attack_run,
-        "metrics": judging.metrics_as_settings(metrics or {}),
+        "metrics": judging.metrics_to_settings(metrics or {}),
     }
     if loaded:
-        naming.check_not_of_scene(set_options)
+        naming.check_no_scene_settings(set_options)
     described |= _describe_scenes(scenes, loaded)
     run_setting = {"run": None if run is None else str(run)}
     config = SweepConfig(**{**defaults, **described, **set_options, **run_setting})
-    config = config.with_only_here(
+    config = config.with_python_only_parts(
         _find_python_only(config, networks, loaded, task, tracker, controls)
     )
     _check_config(config)
     progress = watcher(progress)
     are_named = all(isinstance(network, (str, Path)) for network in networks)
-    has_objects = bool(loaded) or bool(loading.only_here(controls))
-    if has_objects or not are_named or isinstance(task, OwnTask):
-        naming.check_not_spread(set_options)
+    has_objects = bool(loaded) or bool(loading.list_session_only_controls(controls))
+    if has_objects or not are_named or isinstance(task, FunctionTask):
+        naming.check_no_worker_settings(set_options)
     return _run_config(
         config,
         scenes=loaded,
@@ -223,7 +228,9 @@ def _load_defaults(
     defaults = dict[str, Any]()
     if attack_run is not None:
         file = find_run(str(attack_run)) / CONFIG
-        defaults = SweepConfig.of_attack(file, {"grid": grid, "controls": controls})
+        defaults = SweepConfig.load_attack_defaults(
+            file, {"grid": grid, "controls": controls}
+        )
     if scene is None and not defaults:
         raise InputError(
             "scene: expected what load_scene returns or takes, got nothing; name one"
@@ -271,7 +278,7 @@ def _describe_scenes(
             for scene in scenes
         ]
         return {"object": ",".join(names)}
-    settings: dict[str, object] = dict(loading.scene_as_settings(loaded[0].scene))
+    settings: dict[str, object] = dict(loading.scene_to_settings(loaded[0].scene))
     for name in ("object", "environment"):
         values = dict.fromkeys(getattr(scene, name) for scene in loaded)
         settings[name] = ",".join(values)
@@ -290,18 +297,24 @@ def _find_python_only(
 ) -> list[PythonOnly]:
     """Return what exists in this session only, so that no command can repeat it."""
     parts = [
-        PythonOnly("model", model_name(model))
+        PythonOnly("model", get_model_name(model))
         for model in models
-        if naming.exists_here(model)
+        if naming.is_session_only(model)
     ]
-    if any(scene.scene.only_here for scene in scenes):
+    if any(scene.scene.is_session_only for scene in scenes):
         parts.append(PythonOnly("scene"))
     if isinstance(task, Task) and not is_named(task, make_task):
         parts.append(PythonOnly("task", task.name))
-    parts += [PythonOnly("metric", name) for name in judging.only_here(config.metrics)]
+    parts += [
+        PythonOnly("metric", name)
+        for name in judging.list_session_only_metrics(config.metrics)
+    ]
     if tracker is not None:
         parts.append(PythonOnly("tracker"))
-    parts += [PythonOnly("control", name) for name in loading.only_here(controls)]
+    parts += [
+        PythonOnly("control", name)
+        for name in loading.list_session_only_controls(controls)
+    ]
     return parts
 
 
@@ -312,7 +325,7 @@ def _check_config(config: SweepConfig) -> None:
         InputError: they cannot, or there is none.
     """
     if config.workers is not None or config.cluster is not None:
-        judging.check_shared(config.metrics)
+        judging.check_metrics_importable(config.metrics)
     stored_things = {
         "keep_pictures": "them",
         "aov": "the layers",
@@ -352,8 +365,10 @@ def _run_config(
     if config.run is not None and resumed is None:
         context = begun(config)
     with context as directory:
-        named_scenes = scenes or _places(config)
-        job = _make_job(config, named_scenes, naming.several(models), task, controls)
+        named_scenes = scenes or load_scenes(config)
+        job = _make_job(
+            config, named_scenes, naming.list_models(models), task, controls
+        )
         job = replace(
             job,
             metrics=load_metrics(config.metrics, metrics),
@@ -361,8 +376,8 @@ def _run_config(
         )
         if config.run is not None:
             return _run_in_directory(config, job, progress, directory)
-        with executor_for(config, WORKER, progress) as executor:
-            return Sweep(job, None, progress, executor).carry_out()
+        with open_executor(config, WORKER, progress) as executor:
+            return Sweep(job, None, progress, executor).execute()
 
 
 def _find_resumable(config: SweepConfig) -> Path | None:
@@ -376,8 +391,8 @@ def _find_resumable(config: SweepConfig) -> Path | None:
     config_file = path / CONFIG
     if config.overwrite or not is_run(path) or not config_file.is_file():
         return None
-    stored = SweepConfig.from_yaml(config_file, config.asked)
-    if stored.plain() != config.to_repeat().plain() or finished(path):
+    stored = SweepConfig.from_yaml(config_file, config.session_settings)
+    if stored.to_json() != config.make_repeatable().to_json() or finished(path):
         return None
     return path
 
@@ -399,7 +414,7 @@ def sweep_from_config(
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
     progress.stage(LOADING)
-    return _run_in_directory(config, job_of(config), progress, resumed)
+    return _run_in_directory(config, load_job(config), progress, resumed)
 
 
 def _add_adversarial_arm(
@@ -424,7 +439,7 @@ def _add_adversarial_arm(
     if config.adversarial_of is None:
         return tuple(named_scenes)
     directory = find_run(config.adversarial_of)
-    summary = attack_of(directory)
+    summary = load_attack_summary(directory)
     attack_config = AttackConfig.from_yaml(directory / CONFIG)
     if summary.adversarial is None:
         raise InputError(
@@ -432,7 +447,7 @@ def _add_adversarial_arm(
             "is no adversarial configuration "
             "to sweep"
         )
-    held = given_to(attack_config, attack_config.controls)
+    held = make_configured_controls(attack_config, attack_config.controls)
     varied_names = {control.name for control in sampled}
     varied_names |= {axis.instance for axis in axes}
     held_names = {control.name for control in held}
@@ -448,12 +463,10 @@ def _add_adversarial_arm(
     if name == CLEAN:
         name = f"{name}'s"
     clean = [
-        replace(named_scene, held=held, beside_clean=CLEAN)
+        replace(named_scene, fixed_controls=held, arm=CLEAN)
         for named_scene in named_scenes
     ]
-    adversarial = [
-        replace(named_scene, u=u, beside_clean=name) for named_scene in clean
-    ]
+    adversarial = [replace(named_scene, u=u, arm=name) for named_scene in clean]
     return (*clean, *adversarial)
 
 
@@ -467,24 +480,24 @@ def _as_list(value: Any) -> list[Any]:
     return values
 
 
-def job_of(config: SweepConfig) -> Job:
+def load_job(config: SweepConfig) -> Job:
     """Load everything that a configuration names."""
-    named_scenes = _places(config)
+    named_scenes = load_scenes(config)
     job = _make_job(config, named_scenes, config.models, config.task, config.controls)
     return replace(job, metrics=load_metrics(config.metrics))
 
 
-def scenes_of(config: SweepConfig) -> OpenScenes:
+def load_scenes_of_sweep(config: SweepConfig) -> SceneLoader:
     """Return what renders images of a sweep again, after checking all that it names."""
-    job = job_of(config)
-    check_all(job)
-    return OpenScenes(job)
+    job = load_job(config)
+    check_job(job)
+    return SceneLoader(job)
 
 
 def row_parameters(config: SweepConfig) -> set[str]:
     """Load everything that a sweep names, and return the parameters of its rows."""
-    job = scenes_of(config).job
-    space = job.space(job.places[0], job.sizes[0])
+    job = load_scenes_of_sweep(config).job
+    space = job.bind_controls(job.scenes[0], job.image_sizes[0])
     middle = torch.full_like(space.start, 0.5)
     # A choice may describe other parameters than another one.
     return {name for u in (space.start, middle) for name in space.describe(u)}
@@ -512,11 +525,11 @@ def _make_job(
     # A control that travels along the path is added where none does.
     travel_settings = ("path", "shutter", "rolling") if config.path is not None else ()
     naming.check_run_settings(config.model_copy(update=dict.fromkeys(travel_settings)))
-    sampled = given_to(config, controls)
+    sampled = make_configured_controls(config, controls)
     grid = config.grid
     if config.path is not None:
-        sampled, grid = with_frames(config, sampled)
-    axes = read_axes(grid, sampled)
+        sampled, grid = add_frames(config, sampled)
+    axes = parse_axes(grid, sampled)
     if config.samples is not None and not sampled:
         raise InputError(
             "samples: expected `controls` beside it, which says what is drawn by "
@@ -536,9 +549,11 @@ def _make_job(
         config, named_scenes, models, task
     )
     warnings += _find_scene_notes(named_scenes, sampled, axes)
-    job = Job(config, named_scenes, networks, tasks, sampled, axes, aovs_of(config.aov))
+    job = Job(
+        config, named_scenes, networks, tasks, sampled, axes, parse_aovs(config.aov)
+    )
     for named_scene in named_scenes:
-        warnings += job.space(named_scene, job.sizes[0]).notes(
+        warnings += job.bind_controls(named_scene, job.image_sizes[0]).list_notes(
             named_scene.scene.description
         )
     return replace(job, warnings=tuple(dict.fromkeys(warnings)))
@@ -553,7 +568,7 @@ def _with_camera_units(
         for named_scene in named_scenes
     )
     return tuple(
-        replace(axis, parameter=measured_in(axis.parameter, are_sized))
+        replace(axis, parameter=adapt_length_unit(axis.parameter, are_sized))
         if axis.control == CameraControl.kind
         else axis
         for axis in axes
@@ -572,7 +587,7 @@ def _load_models_and_tasks(
         The models, the tasks, and remarks on both.
     """
     shared_task = make_task(task)
-    _check_different([model_name(model) for model in models])
+    _check_different([get_model_name(model) for model in models])
     networks, warnings = load_models(models, shared_task, config)
     # A file or a function may return a model that has the name of another one.
     _check_different([network.name for network in networks])
@@ -589,13 +604,13 @@ def _load_models_and_tasks(
         for network in networks
     )
     warnings += [remark for network_task in tasks for remark in network_task.remarks]
-    if config.judge == ALL:
-        tasks = tuple(map(each_thing, tasks))
+    if config.judge == ALL_THINGS:
+        tasks = tuple(map(make_each_thing_task, tasks))
     labels = {
         named_scene.object: named_scene.scene.description.object.label
         for named_scene in named_scenes
     }
-    warnings += judging.one_label_for_several(networks, config.label, labels)
+    warnings += judging.find_label_warnings(networks, config.label, labels)
     return networks, tasks, warnings
 
 
@@ -608,14 +623,14 @@ def _find_scene_notes(
     notes = list[str]()
     for named_scene in named_scenes:
         description = named_scene.scene.description
-        for control in on_grid(controls, axes, description):
+        for control in add_grid_axes(controls, axes, description):
             if control.kind == ENVIRONMENT:
                 description = control.prepare(description)
         notes += description.notes
     return notes
 
 
-def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
+def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
     """Load the scenes of a configuration: every object in every environment.
 
     A scene that a Python caller passed is returned as it is.
@@ -623,11 +638,12 @@ def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
     passed: Scene | None = config.python_object(naming.SCENE, config.object)
     if passed is not None:
         return (NamedScene(config.object, passed.description.environment_name, passed),)
-    objects = naming.different(config.objects, "object")
-    environments = naming.different(config.environments, "environment")
+    objects = naming.check_distinct(config.objects, "object")
+    environments = naming.check_distinct(config.environments, "environment")
     first_environment = environments[0] if config.environment else None
     scenes = {
-        name: naming.scene_of(config, name, first_environment) for name in objects
+        name: naming.load_configured_scene(config, name, first_environment)
+        for name in objects
     }
     if first_environment is None:
         return tuple(
@@ -640,7 +656,7 @@ def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
         scene = load_scene(first_scene.object, name)
         maps[name] = scene.description.environment
     return tuple(
-        NamedScene(name, environment, scenes[name].lit_by(maps[environment]))
+        NamedScene(name, environment, scenes[name].with_environment(maps[environment]))
         for name in objects
         for environment in maps
     )
@@ -661,20 +677,20 @@ def _run_in_directory(
     """Run a sweep in its run directory, or continue it in the one of before."""
     with (
         RunDirectory.of(config, resumed) as run,
-        executor_for(config, WORKER, progress) as executor,
+        open_executor(config, WORKER, progress) as executor,
     ):
         functions: dict[str, Callable[..., Any] | None] = {
             f"metric {name}": function for name, function in job.metrics.items()
         }
-        functions["task"] = function_of(job.tasks[0])
-        check_made_of(run, job.models, functions)
-        return Sweep(job, run, progress, executor).carry_out()
+        functions["task"] = get_task_function(job.tasks[0])
+        check_digests(run, job.models, functions)
+        return Sweep(job, run, progress, executor).execute()
 
 
-def sweep_worker(settings: JsonObject) -> Call:
+def sweep_worker(settings: JsonObject) -> BatchFunction:
     """Return the function by which a worker evaluates queries of a sweep.
 
     Args:
         settings: of the sweep.
     """
-    return worker_call(OpenScenes(job_of(SweepConfig(**settings))).named)
+    return make_worker_call(SceneLoader(load_job(SweepConfig(**settings))).load_by_name)

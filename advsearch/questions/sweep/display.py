@@ -96,7 +96,7 @@ def _longest_label(values: Sequence[Any]) -> int:
     return max(map(len, _ticks(values)[1]))
 
 
-def sweep_figure(summary: SweepSummary) -> Figures:
+def draw_sweep(summary: SweepSummary) -> Figures:
     """Draw a sweep: a map over two axes, or the accuracy over the only one.
 
     A cell shows the accuracy there; if no cell has more than one configuration, the
@@ -105,11 +105,11 @@ def sweep_figure(summary: SweepSummary) -> Figures:
     size = figure_size(summary)
     if size is None:
         return {}
-    return figure_of(lambda axes: sweep_axes(summary, axes), size)
+    return figure_of(lambda axes: draw_sweep_on(summary, axes), size)
 
 
-def sweep_axes(summary: SweepSummary, axes: Any) -> None:
-    """Draw a sweep on matplotlib axes, as `sweep_figure` does."""
+def draw_sweep_on(summary: SweepSummary, axes: Any) -> None:
+    """Draw a sweep on matplotlib axes, as `draw_sweep` does."""
     if summary.cells:
         _draw_map(axes, summary, summary.cells)
     elif _only_axis(summary):
@@ -259,7 +259,7 @@ SURFACE_COLUMNS: dict[str, Column] = {
 }
 
 
-def shown(summary: SweepSummary) -> ShownResult:
+def make_sweep_view(summary: SweepSummary) -> ShownResult:
     """Return the view of a sweep."""
     axes = _group_axes(summary)
     sections = [*_text_sections(summary, axes)]
@@ -267,7 +267,9 @@ def shown(summary: SweepSummary) -> ShownResult:
     if size is not None:
         sections.append(
             ResultPart(
-                draw=lambda axes: sweep_axes(summary, axes), size=size, only="notebook"
+                draw=lambda axes: draw_sweep_on(summary, axes),
+                size=size,
+                only="notebook",
             )
         )
     sections += (replace(part, only="page") for part in _page_parts(summary, axes))
@@ -307,7 +309,7 @@ def _text_sections(
     if summary.beside is not None and summary.ending != INTERRUPTED:
         for pair in summary.beside.pairs:
             yield _arms_table(summary.beside.answer, pair, summary.task)
-    distance = distance_of(summary)
+    distance = find_detection_distance(summary)
     if distance:
         yield ResultPart(text=[distance_sentence(distance)])
     for rates in summary.drives or ():
@@ -388,13 +390,13 @@ def _page_parts(
         summary: of the sweep.
         axes: from `_group_axes`.
     """
-    distance = distance_of(summary)
+    distance = find_detection_distance(summary)
     if distance:
         sentence = distance_sentence(distance)
         yield ResultPart(
             "How far away it is seen",
             [sentence],
-            draw=partial(distance_axes, distance),
+            draw=partial(draw_detection_distance, distance),
             note=sentence,
         )
     for index, rates in enumerate(summary.drives or ()):
@@ -455,7 +457,7 @@ def _verdict(summary: SweepSummary) -> str:
     configurations = count(summary.configurations, "configuration")
     return (
         f"The model is right in {summary.correct} of {configurations} "
-        f"({rate}){of_grid(summary)}{outcomes}."
+        f"({rate}){grid_clause(summary)}{outcomes}."
     )
 
 
@@ -468,7 +470,7 @@ def outcomes_clause(summary: SweepSummary) -> str:
     return f"; of the others, {text}" if text else ""
 
 
-def of_grid(summary: SweepSummary) -> str:
+def grid_clause(summary: SweepSummary) -> str:
     """Return the caution about an accuracy over a grid, where nothing is sampled."""
     if summary.sampler is not None or not summary.grid:
         return ""
@@ -519,7 +521,7 @@ def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
     return ResultPart(title, rows=lines)
 
 
-def claims(result: SweepSummary) -> Iterator[Claim]:
+def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
     """Yield what a finished sweep measured.
 
     That is the fraction of right predictions, the detection distance, the rates over
@@ -534,7 +536,7 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
         if result.beside.pairs:
             return
     yield from _accuracy_claims(result, population, note)
-    distance = distance_of(result)
+    distance = find_detection_distance(result)
     if distance:
         yield claim("measured", distance_sentence(distance), None)
     for rates in result.drives or ():
@@ -769,49 +771,49 @@ HALF = 0.5
 
 
 @dataclass(frozen=True)
-class SeenFrom:
+class DetectionDistance:
     """The distance at which an object is first detected by a camera that comes nearer.
 
     Attributes:
         unit: "metres" or "object sizes".
         distances: (m,) at which there are images, the nearest first.
-        shares: (m,) of the images that are right.
+        right_fractions: (m,) of the images that are right.
         intervals: (m,) theirs, 95 %.
         distance: the estimate; None if it is detected at all distances, or at none. If
             the fraction does not fall with the distance, the last one: beyond the dips
             that are not chance.
-        low: lower bound of its interval; None if images do not bound it.
-        high: upper bound, likewise.
-        lacking: how many images at a distance any bound takes, if none has as many.
-        loose: (m,) images in which a loose box is on it, which count neither as right
+        lower: lower bound of its interval; None if images do not bound it.
+        upper: upper bound, likewise.
+        min_images: how many images at a distance any bound takes, if none has as many.
+        loose_counts: (m,) images in which a loose box is on it, which count neither as right
             nor as missed; empty if that is not known.
-        counts: (m,) images.
+        image_counts: (m,) images.
         dips: distances at which it is detected less often than beyond them, the nearest
             first.
-        everywhere: whether the falling line nowhere crosses one half, because it is
+        is_above_half: whether the falling line nowhere crosses one half, because it is
             detected in that many images at all distances.
     """
 
     unit: str
     distances: tuple[float, ...]
-    shares: tuple[float, ...]
+    right_fractions: tuple[float, ...]
     intervals: tuple[tuple[float, float], ...]
     distance: float | None
-    low: float | None
-    high: float | None
-    lacking: int | None
-    loose: tuple[int, ...] = ()
-    counts: tuple[int, ...] = ()
+    lower: float | None
+    upper: float | None
+    min_images: int | None
+    loose_counts: tuple[int, ...] = ()
+    image_counts: tuple[int, ...] = ()
     dips: tuple[Dip, ...] = ()
-    everywhere: bool = False
+    is_above_half: bool = False
 
     @property
     def is_monotone(self) -> bool:
         """Whether all dips may be chance."""
-        return not any(dip.is_shown for dip in self.dips)
+        return not any(dip.is_significant for dip in self.dips)
 
 
-def distance_of(summary: SweepSummary) -> SeenFrom | None:
+def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
     """Return how far away a detector sees an object.
 
     None if the sweep does not measure it: one model, one object, several distances and
@@ -829,10 +831,10 @@ def distance_of(summary: SweepSummary) -> SeenFrom | None:
     are_independent = summary.drives is None and summary.units is None
     if not (is_detection and is_single and are_independent and len(rows) > 1):
         return None
-    return seen_from(rows)
+    return compute_detection_distance(rows)
 
 
-def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
+def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     """Compute the distance at which an object is first detected.
 
     Args:
@@ -856,23 +858,24 @@ def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
     dips = find_dips(distances, k, n)
     # The line is fitted beyond the last dip that is not chance.
     first = max(
-        (distances.index(dip.distance) + 1 for dip in dips if dip.is_shown), default=0
+        (distances.index(dip.distance) + 1 for dip in dips if dip.is_significant),
+        default=0,
     )
     falling = _fit_falling(k[first:], n[first:])
     min_images = math.floor(-math.log2(significance)) + 1
-    return SeenFrom(
+    return DetectionDistance(
         unit=rows[0].unit,
         distances=distances,
-        shares=tuple((k / n).tolist()),
+        right_fractions=tuple((k / n).tolist()),
         intervals=tuple(row.interval or (0.0, 1.0) for row in rows),
         distance=_find_crossing(np.array(distances[first:]), falling),
-        low=low,
-        high=high,
-        lacking=None if (n >= min_images).any() else min_images,
-        loose=_count_loose(rows),
-        counts=tuple(n.tolist()),
+        lower=low,
+        upper=high,
+        min_images=None if (n >= min_images).any() else min_images,
+        loose_counts=_count_loose(rows),
+        image_counts=tuple(n.tolist()),
         dips=dips,
-        everywhere=bool(falling[-1] >= HALF),
+        is_above_half=bool(falling[-1] >= HALF),
     )
 
 
@@ -929,7 +932,7 @@ def _count_loose(rows: Sequence[AxisRow]) -> tuple[int, ...]:
     return tuple(counts.get(Outcome.LOOSE.value, 0) for counts in outcomes)
 
 
-def distance_sentence(estimate: SeenFrom) -> str:
+def distance_sentence(estimate: DetectionDistance) -> str:
     """Return the detection distance as text: "Seen from 38 m, 31 to 44 m ...".
 
     Dips, which contradict it, and loose boxes follow.
@@ -943,7 +946,7 @@ def distance_sentence(estimate: SeenFrom) -> str:
     if not estimate.is_monotone:
         if distance is not None:
             beyond = f"Beyond that the share falls below a half at {distance} {unit}"
-        elif estimate.everywhere:
+        elif estimate.is_above_half:
             beyond = (
                 "Beyond that it is right in at least half of the pictures, up to "
                 f"{farthest}"
@@ -953,7 +956,7 @@ def distance_sentence(estimate: SeenFrom) -> str:
         return " ".join(filter(None, [*dips, f"{beyond}; {interval}.", loose]))
     if distance is not None:
         sentence = f"Seen from {distance} {unit} in half of the pictures, {interval}."
-    elif estimate.everywhere:
+    elif estimate.is_above_half:
         sentence = (
             "Seen in at least half of the pictures up to the farthest distance, "
             f"{farthest}; {interval}."
@@ -966,10 +969,10 @@ def distance_sentence(estimate: SeenFrom) -> str:
     return " ".join(filter(None, [sentence, *dips, loose]))
 
 
-def _interval_clause(estimate: SeenFrom, unit: str) -> str:
+def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
     """Return the interval of the detection distance."""
-    low = None if estimate.low is None else f"{estimate.low:.3g}"
-    high = None if estimate.high is None else f"{estimate.high:.3g}"
+    low = None if estimate.lower is None else f"{estimate.lower:.3g}"
+    high = None if estimate.upper is None else f"{estimate.upper:.3g}"
     if low and high:
         bounds = f"{low} to {high} {unit}"
     elif low:
@@ -979,53 +982,60 @@ def _interval_clause(estimate: SeenFrom, unit: str) -> str:
     else:
         bounds = "no bound"
     clause = f"{bounds} with 95 % confidence"
-    if estimate.lacking is not None:
-        clause += f" (that takes at least {estimate.lacking} pictures at each distance)"
+    if estimate.min_images is not None:
+        clause += (
+            f" (that takes at least {estimate.min_images} pictures at each distance)"
+        )
     return clause
 
 
-def _dips_sentences(estimate: SeenFrom, unit: str) -> list[str]:
+def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     """Return where an object is detected less often than beyond.
 
     All dips that are not chance, or else the deepest of those that may be.
     """
-    proven = [dip for dip in estimate.dips if dip.is_shown]
+    proven = [dip for dip in estimate.dips if dip.is_significant]
     if proven:
         clauses = "; ".join(_dip_clause(dip, unit) for dip in proven)
         return [f"No one distance from which on it is seen: right in {clauses}."]
-    until = estimate.distances[-1] if estimate.everywhere else estimate.distance or 0.0
+    until = (
+        estimate.distances[-1] if estimate.is_above_half else estimate.distance or 0.0
+    )
     below_half = [
         dip
         for dip in estimate.dips
-        if dip.seen[0] < HALF * dip.seen[1]
+        if dip.counts[0] < HALF * dip.counts[1]
         # a rise beyond the estimate counts too
-        and (dip.distance < until or dip.beyond[0] >= HALF * dip.beyond[1])
+        and (
+            dip.distance < until or dip.counts_beyond[0] >= HALF * dip.counts_beyond[1]
+        )
     ]
     if not below_half:
         return []
-    deepest = _dip_clause(min(below_half, key=lambda dip: dip.p), unit)
+    deepest = _dip_clause(min(below_half, key=lambda dip: dip.p_value), unit)
     return [f"Nearer it is right less often: in {deepest}, which may be chance."]
 
 
 def _dip_clause(dip: Dip, unit: str) -> str:
     at_dip = f"{dip.seen[0]} of {dip.seen[1]} at {dip.distance:.3g} {unit}"
-    beyond = (
-        f"{dip.beyond[0]} of {dip.beyond[1]} beyond it up to {dip.until:.3g} {unit}"
-    )
-    return f"{at_dip}, {beyond} (p = {dip.p:.2g})"
+    beyond = f"{dip.counts_beyond[0]} of {dip.counts_beyond[1]} beyond it up to {dip.until:.3g} {unit}"
+    return f"{at_dip}, {beyond} (p = {dip.p_value:.2g})"
 
 
-def _loose_sentence(estimate: SeenFrom, unit: str) -> str:
+def _loose_sentence(estimate: DetectionDistance, unit: str) -> str:
     """Return in how many images a loose box is on the object, by distance.
 
     Empty if there is none.
     """
-    if not sum(estimate.loose):
+    if not sum(estimate.loose_counts):
         return ""
     clauses = [
         f"{n_loose} of {n_images} at {distance:.3g} {unit}"
         for distance, n_loose, n_images in zip(
-            estimate.distances, estimate.loose, estimate.counts, strict=True
+            estimate.distances,
+            estimate.loose_counts,
+            estimate.image_counts,
+            strict=True,
         )
         if n_loose
     ]
@@ -1035,7 +1045,7 @@ def _loose_sentence(estimate: SeenFrom, unit: str) -> str:
     )
 
 
-def distance_axes(estimate: SeenFrom, axes: Any) -> None:
+def draw_detection_distance(estimate: DetectionDistance, axes: Any) -> None:
     """Draw the fraction of detections over the distance on matplotlib axes."""
     low, high = zip(*estimate.intervals, strict=True)
     axes.fill_between(
@@ -1048,13 +1058,20 @@ def distance_axes(estimate: SeenFrom, axes: Any) -> None:
         label="95 % interval",
     )
     axes.plot(
-        estimate.distances, estimate.shares, color=BLUE, marker="o", label="seen in"
+        estimate.distances,
+        estimate.right_fractions,
+        color=BLUE,
+        marker="o",
+        label="seen in",
     )
-    if any(estimate.loose):
+    if any(estimate.loose_counts):
         with_loose = [
             fraction + n_loose / n_images
             for fraction, n_loose, n_images in zip(
-                estimate.shares, estimate.loose, estimate.counts, strict=True
+                estimate.right_fractions,
+                estimate.loose_counts,
+                estimate.image_counts,
+                strict=True,
             )
         ]
         axes.plot(

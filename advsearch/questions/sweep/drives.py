@@ -18,26 +18,26 @@ import numpy.typing as npt
 import torch
 
 from advsearch.controls import Control
-from advsearch.engine.naming import given_to
+from advsearch.engine.naming import make_configured_controls
 from advsearch.options import OUT_OF_VIEW
-from advsearch.questions.attack.result import evenly, write_drive
+from advsearch.questions.attack.result import save_drive, select_evenly
 from advsearch.questions.sweep.axes import Axis
-from advsearch.questions.sweep.job import Job, OpenScenes
+from advsearch.questions.sweep.job import Job, SceneLoader
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import (
     DriveRates,
-    OneDrive,
+    DriveRecord,
     OverDrives,
     TrackRates,
 )
-from advsearch.questions.sweep.tracks import DetectedFrame, frame_of, tracked
+from advsearch.questions.sweep.tracks import DetectedFrame, read_frame, track_drive
 from advsearch.report.figures import marked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.runs.tables import Units
-from advsearch.statistics.clustered import mean_interval, per_unit
+from advsearch.statistics.clustered import mean_interval, sum_per_unit
 from advsearch.tasks import Detection
-from advsearch.tasks.boxes import LEAST_OVERLAP
+from advsearch.tasks.boxes import MIN_OVERLAP
 
 MAX_ANIMATED_FRAMES = 60
 MAX_LISTED_DRIVES = 1000  # drives of a model that a result lists
@@ -47,7 +47,7 @@ HIDDEN = 2  # nothing of the object is in the image
 Flags = npt.NDArray[np.int8]
 
 
-def with_frames(
+def add_frames(
     config: SweepConfig, sampled: tuple[Control, ...]
 ) -> tuple[tuple[Control, ...], dict[str, object]]:
     """Return the controls and the grid of a sweep over the frames of a path.
@@ -61,10 +61,10 @@ def with_frames(
     """
     travelling: Any = next((control for control in sampled if control.travels), None)
     if travelling is None:
-        (travelling,) = given_to(config, {"path": {}})
+        (travelling,) = make_configured_controls(config, {"path": {}})
         sampled = (*sampled, travelling)
     time_name = f"{travelling.name}.time"
-    path_name = f"{travelling.name}.{Control.WAY}"
+    path_name = f"{travelling.name}.{Control.PATH_PARAMETER}"
     seconds = travelling.seconds
     grid = config.grid
     if time_name not in grid:
@@ -74,18 +74,20 @@ def with_frames(
         (
             parameter.options
             for parameter in travelling.own
-            if parameter.name == Control.WAY
+            if parameter.name == Control.PATH_PARAMETER
         ),
         (),
     )
-    is_path_free = path_name not in grid and Control.WAY not in travelling.specs
+    is_path_free = (
+        path_name not in grid and Control.PATH_PARAMETER not in travelling.specs
+    )
     if paths and config.samples is None and is_path_free:
         # Nothing is sampled, so every path is swept.
         grid = {path_name: list(paths), **grid}
     return sampled, grid
 
 
-def time_axis(axes: Sequence[Axis]) -> int | None:
+def find_time_axis(axes: Sequence[Axis]) -> int | None:
     """Return the index of the axis whose values are frames.
 
     None if there is none, or a single frame.
@@ -96,7 +98,7 @@ def time_axis(axes: Sequence[Axis]) -> int | None:
     return None
 
 
-def planned_distances(job: Job, axis: Axis) -> tuple[float, float] | None:
+def compute_distance_bounds(job: Job, axis: Axis) -> tuple[float, float] | None:
     """Return the nearest and the farthest distance that a drive of a sweep can have.
 
     These are bounds from the plan: over all paths, also those that were not sampled,
@@ -112,8 +114,8 @@ def planned_distances(job: Job, axis: Axis) -> tuple[float, float] | None:
     times = torch.tensor([float(value) for value in axis.values])
     lowest = math.inf
     highest = -math.inf
-    for scene in range(len(job.places)):
-        for points in job.bound(scene).values():
+    for scene in range(len(job.scenes)):
+        for points in job.load_points(scene).values():
             control: Any = next(
                 (
                     control
@@ -157,14 +159,14 @@ class Drives:
     _distance_bounds: tuple[float, float] | None = None
 
     def __init__(self, job: Job, rows: Iterable[Row]) -> None:
-        axis_index = time_axis(job.axes)
+        axis_index = find_time_axis(job.axes)
         assert axis_index is not None
         self._job = job
         axis = job.axes[axis_index]
-        self._units = next(iter(job.bound(0).values())).units
-        self._distance_bounds = planned_distances(job, axis)
+        self._units = next(iter(job.load_points(0).values())).units
+        self._distance_bounds = compute_distance_bounds(job, axis)
         shape = (
-            len(job.places),
+            len(job.scenes),
             *(len(axis.values) for axis in job.axes),
             job.samples,
             len(job.models),
@@ -203,7 +205,7 @@ class Drives:
         """
         job = self._job
         right_names = self._find_right_names()
-        path_name = f"{instance}.{Control.WAY}"
+        path_name = f"{instance}.{Control.PATH_PARAMETER}"
         distance_name = f"{instance}.distance"
         for row in rows:
             image, model = divmod(row.step, len(job.models))
@@ -212,9 +214,9 @@ class Drives:
             if distance_name in row.values:
                 distance.flat[image] = float(str(row.values[distance_name]["value"]))
                 self._distance_unit = row.values[distance_name]["unit"]
-            names = right_names.get((image // job.per_scene, model))
+            names = right_names.get((image // job.images_per_scene, model))
             if names is not None and isinstance(row.payload, dict):
-                self._frame_of_step[row.step] = frame_of(row.payload, names)
+                self._frame_of_step[row.step] = read_frame(row.payload, names)
             if path_name in row.values:
                 self._path_of_step[row.step] = str(row.values[path_name]["value"])
 
@@ -222,11 +224,11 @@ class Drives:
         """Return the names of the right classes by scene and model, of detectors."""
         job = self._job
         right_names: dict[tuple[int, int], Collection[str]] = {}
-        for scene, named_scene in enumerate(job.places):
+        for scene, named_scene in enumerate(job.scenes):
             for model, task in enumerate(job.tasks):
                 if isinstance(task, Detection):
-                    classes = task.right_classes(job.facts(named_scene, {}))
-                    right_names[scene, model] = task.names(classes)
+                    classes = task.find_right_classes(job.make_facts(named_scene, {}))
+                    right_names[scene, model] = task.get_class_names(classes)
         return right_names
 
     def _select_complete(self, scenes: list[int], model: int) -> _CompleteDrives:
@@ -240,21 +242,19 @@ class Drives:
         selected = is_known & is_visible
         return _CompleteDrives(flags[selected], distance[selected], steps[selected])
 
-    def rates(self) -> list[DriveRates]:
+    def compute_rates(self) -> list[DriveRates]:
         """Compute the rates over drives of each model, by adversarial scene.
 
         Frames without the object count neither as right nor as part of a gap. Models
         without a complete drive are left out.
         """
         rates = list[DriveRates]()
-        named_scenes = self._job.places
-        for answer in dict.fromkeys(
-            named_scene.beside_clean for named_scene in named_scenes
-        ):
+        named_scenes = self._job.scenes
+        for answer in dict.fromkeys(named_scene.arm for named_scene in named_scenes):
             scenes = [
                 scene
                 for scene, named_scene in enumerate(named_scenes)
-                if named_scene.beside_clean == answer
+                if named_scene.arm == answer
             ]
             for model in range(len(self._job.models)):
                 drives = self._select_complete(scenes, model)
@@ -285,8 +285,10 @@ class Drives:
             repeats=math.ceil(len(drives.flags) / n_drives),
             frames=n_frames,
             seconds=self.seconds,
-            right=over_drives(_right_fraction(drives.flags), min, drive_of_value=drive),
-            longest_gap=over_drives(
+            right=summarize_drives(
+                _right_fraction(drives.flags), min, drive_of_value=drive
+            ),
+            longest_gap=summarize_drives(
                 self._longest_gaps(drives.flags), max, (0.0, max_gap), drive
             ),
             first_seen=self._first_detection(
@@ -294,7 +296,7 @@ class Drives:
             ),
             unit=self._distance_unit,
             never_seen=n_drives - n_right_drives,
-            flicker=over_drives(
+            flicker=summarize_drives(
                 self._changes_per_second(drives.flags), max, (0.0, max_flicker), drive
             ),
             tracks=self._compute_track_rates(model, drives.steps, drive),
@@ -303,7 +305,7 @@ class Drives:
 
     def _describe_drives(
         self, drives: _CompleteDrives, first_distance: npt.NDArray[np.float64]
-    ) -> list[OneDrive]:
+    ) -> list[DriveRecord]:
         """Return the values of the first drives, each by itself.
 
         Args:
@@ -315,7 +317,7 @@ class Drives:
         flicker = self._changes_per_second(drives.flags)
         first_steps = drives.steps[:MAX_LISTED_DRIVES, 0].tolist()
         return [
-            OneDrive(
+            DriveRecord(
                 row=step,
                 path=self._path_of_step.get(step),
                 right=float(right_fraction[index]),
@@ -333,7 +335,7 @@ class Drives:
 
     def _longest_gaps(self, flags: Flags) -> npt.NDArray[np.float64]:
         """Return the seconds (n,) of the longest run of wrong frames of each drive."""
-        runs = np.array([longest(is_wrong) for is_wrong in flags == 0])
+        runs = np.array([find_longest_run(is_wrong) for is_wrong in flags == 0])
         return runs * self._frame_interval
 
     def _changes_per_second(self, flags: Flags) -> npt.NDArray[np.float64]:
@@ -357,7 +359,7 @@ class Drives:
         """
         if not len(distance) or not np.isfinite(distance).all():
             return None
-        return over_drives(distance, min, self._distance_bounds, drive)
+        return summarize_drives(distance, min, self._distance_bounds, drive)
 
     def _compute_track_rates(
         self, model: int, steps: npt.NDArray[np.int64], drive: npt.NDArray[np.int64]
@@ -379,10 +381,15 @@ class Drives:
         if any(step not in self._frame_of_step for step in steps.flat):
             return None
         frames = [[self._frame_of_step[step] for step in row] for row in steps.tolist()]
-        drives = [tracked(drive_frames, tracker, task.iou) for drive_frames in frames]
-        loose_iou = min(LEAST_OVERLAP, task.iou)
+        drives = [
+            track_drive(drive_frames, tracker, task.iou) for drive_frames in frames
+        ]
+        loose_iou = min(MIN_OVERLAP, task.iou)
         lost_loosely = np.array(
-            [tracked(drive_frames, tracker, loose_iou).lost for drive_frames in frames]
+            [
+                track_drive(drive_frames, tracker, loose_iou).lost
+                for drive_frames in frames
+            ]
         )
         lost = np.array([drive.lost for drive in drives], dtype=float)
         switches = np.array([drive.switches for drive in drives], dtype=float)
@@ -391,15 +398,15 @@ class Drives:
         seconds_bounds = (0.0, n_frames * self._frame_interval)
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
-            lost=over_drives(lost, max, drive_of_value=drive),
-            loose=over_drives(lost - lost_loosely, max, drive_of_value=drive),
-            switches=over_drives(switches, max, (0.0, n_frames - 1.0), drive),
-            longest_gap=over_drives(
+            lost=summarize_drives(lost, max, drive_of_value=drive),
+            loose=summarize_drives(lost - lost_loosely, max, drive_of_value=drive),
+            switches=summarize_drives(switches, max, (0.0, n_frames - 1.0), drive),
+            longest_gap=summarize_drives(
                 longest_gap * self._frame_interval, max, seconds_bounds, drive
             ),
         )
 
-    def keep_worst(self, scenes: OpenScenes, run: RunDirectory) -> None:
+    def save_worst(self, scenes: SceneLoader, run: RunDirectory) -> None:
         """Save a strip and an animation of the first model's worst drive.
 
         That is the drive with the fewest right frames; its images have the marks of the
@@ -409,21 +416,23 @@ class Drives:
             scenes: of the sweep.
             run: where they are written.
         """
-        drives = self._select_complete([*range(len(self._job.places))], 0)
+        drives = self._select_complete([*range(len(self._job.scenes))], 0)
         if not len(drives.flags):
             return
         worst = _right_fraction(drives.flags).argmin()
         numbers = drives.steps[worst] // len(self._job.models)
         frames = []
-        for number in numbers[evenly(len(numbers), MAX_ANIMATED_FRAMES)].tolist():
-            scene, (query, *_) = scenes.asked(number)
-            image = scene.picture(query)
-            marks = scene.problems[0].marks(image, query.u)
+        for number in numbers[
+            select_evenly(len(numbers), MAX_ANIMATED_FRAMES)
+        ].tolist():
+            scene, (query, *_) = scenes.make_queries(number)
+            image = scene.render_image(query)
+            marks = scene.problems[0].find_marks(image, query.u)
             frames.append(np.asarray(marked(image.numpy(), marks), dtype=np.float32))
-        write_drive(run, "drive", frames, self.seconds)
+        save_drive(run, "drive", frames, self.seconds)
 
 
-def longest(flags: npt.NDArray[np.bool_]) -> int:
+def find_longest_run(flags: npt.NDArray[np.bool_]) -> int:
     """Return the length of the longest run of true flags (n,)."""
     changes = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
     bounds = np.flatnonzero(changes)  # begin and end of each run, alternating
@@ -449,7 +458,7 @@ def _finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def over_drives(
+def summarize_drives(
     values: npt.NDArray[np.float64],
     worst: Callable[[list[float]], float],
     bounds: tuple[float, float] | None = (0.0, 1.0),
@@ -468,7 +477,7 @@ def over_drives(
     """
     means = values
     if drive_of_value is not None:
-        means = per_unit(values, drive_of_value) / per_unit(
+        means = sum_per_unit(values, drive_of_value) / sum_per_unit(
             np.ones(len(values)), drive_of_value
         )
     interval = None

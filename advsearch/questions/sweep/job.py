@@ -13,30 +13,30 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Evaluation, Query, Trials, run_trials
-from advsearch.attacks.domain import Seeds
+from advsearch.attacks.domain import SeedSequence
 from advsearch.controls import Control, Space, make_control, make_space
-from advsearch.engine.image_changes import AWAY, as_claimed, changed
-from advsearch.engine.journal import Journal, Sent, Shared
-from advsearch.engine.judging import Metrics, check_truth, domain_of
-from advsearch.engine.loading import Scene, framed, make_renderer
-from advsearch.engine.problem import Prepared, Problem
-from advsearch.engine.record import rate_of
-from advsearch.engine.rendering import facts_about
-from advsearch.engine.verifier import Verifier, ladder_of
+from advsearch.engine.image_changes import WITHOUT_OBJECT, change_image, meets_claim
+from advsearch.engine.journal import Journal, ParallelEvaluator, WorkItem
+from advsearch.engine.judging import Metrics, check_truth, make_domain
+from advsearch.engine.loading import Scene, fit_camera, make_renderer
+from advsearch.engine.problem import Preparation, Problem
+from advsearch.engine.record import make_rate
+from advsearch.engine.rendering import make_facts
+from advsearch.engine.verifier import Verifier, choose_ladder
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.features import Features, features_of
 from advsearch.options import Value
 from advsearch.progress import Stages
-from advsearch.questions.sweep.axes import Axis, Drawn, Points, on_grid
-from advsearch.questions.sweep.predicting import PredictedSweep, SweptPicture
+from advsearch.questions.sweep.axes import Axis, Points, SampledNumber, add_grid_axes
+from advsearch.questions.sweep.predicting import SweepPredictor, SweptImage
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import WorstVerified
 from advsearch.questions.sweep.tracks import ConstantVelocity, Tracker
 from advsearch.runs.directory import RunDirectory
-from advsearch.scene.color import to_8_bit
+from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.description import ENVIRONMENT, OBJECT
-from advsearch.scene.formation import next_count
+from advsearch.scene.formation import round_sample_count
 from advsearch.scene.renderer import Renderer
 from advsearch.tasks import Facts, Judgement, Task
 from advsearch.viewer import thumbnails
@@ -54,25 +54,25 @@ class NamedScene:
         object: its name.
         environment: its name.
         scene: as it was loaded.
-        held: controls that do not vary.
+        fixed_controls: controls that do not vary.
         u: (d,) where they are; None: as the scene is.
-        beside_clean: name of the scene beside the same one without or with the
+        arm: name of the scene beside the same one without or with the
             adversarial configuration of a run; empty if nothing is compared.
     """
 
     object: str
     environment: str
     scene: Scene
-    held: tuple[Control, ...] = ()
+    fixed_controls: tuple[Control, ...] = ()
     u: Tensor | None = None
-    beside_clean: str = ""
+    arm: str = ""
 
     @property
     def names(self) -> dict[str, str]:
         """The values of the axes outside the scene, by their names."""
         names = {"object": self.object, "environment": self.environment}
-        if self.beside_clean:
-            names["answer"] = self.beside_clean
+        if self.arm:
+            names["answer"] = self.arm
         return names
 
 
@@ -85,7 +85,7 @@ class Job:
 
     Attributes:
         config: the settings.
-        places: the scenes.
+        scenes: the scenes.
         models: all of which get the same images.
         tasks: one for each model.
         controls: the sampled ones.
@@ -98,7 +98,7 @@ class Job:
     """
 
     config: SweepConfig
-    places: tuple[NamedScene, ...]
+    scenes: tuple[NamedScene, ...]
     models: tuple[Model, ...]
     tasks: tuple[Task, ...]
     controls: tuple[Control, ...]
@@ -121,46 +121,48 @@ class Job:
     @cached_property
     def spp(self) -> int:
         """Samples per pixel, as the sampler has them."""
-        return next_count(self.config.pixel_sampler, self.config.search_spp)
+        return round_sample_count(self.config.pixel_sampler, self.config.search_spp)
 
     @cached_property
-    def sizes(self) -> tuple[ImageSize, ...]:
+    def image_sizes(self) -> tuple[ImageSize, ...]:
         """(height, width) of the images of each model."""
         return tuple(
             self.config.resolution or model.input_size for model in self.models
         )
 
     @cached_property
-    def first_of_size(self) -> tuple[bool, ...]:
+    def is_first_of_size(self) -> tuple[bool, ...]:
         """Of each model, whether no model before it gets the same images."""
         return tuple(
-            size not in self.sizes[:model] for model, size in enumerate(self.sizes)
+            size not in self.image_sizes[:model]
+            for model, size in enumerate(self.image_sizes)
         )
 
     @cached_property
-    def per_scene(self) -> int:
+    def images_per_scene(self) -> int:
         """Images of a scene."""
-        return next(iter(self.bound(0).values())).count
+        return next(iter(self.load_points(0).values())).count
 
     @cached_property
-    def seeds(self) -> Seeds:
-        return Seeds(self.config.seed, KIND)
+    def seeds(self) -> SeedSequence:
+        return SeedSequence(self.config.seed, KIND)
 
-    def bound(self, scene: int) -> dict[ImageSize, Points]:
+    def load_points(self, scene: int) -> dict[ImageSize, Points]:
         """Return the configurations of a scene for each size of image.
 
         Those of the last scene are cached.
         """
         if scene not in self._points_by_scene:
             self._points_by_scene.clear()
-            named_scene = self.places[scene]
-            sizes = dict.fromkeys(self.sizes)
+            named_scene = self.scenes[scene]
+            sizes = dict.fromkeys(self.image_sizes)
             self._points_by_scene[scene] = {
-                size: self.points(self.space(named_scene, size)) for size in sizes
+                size: self.make_points(self.bind_controls(named_scene, size))
+                for size in sizes
             }
         return self._points_by_scene[scene]
 
-    def queries(self, numbers: range) -> list[Sent]:
+    def make_queries(self, numbers: range) -> list[WorkItem]:
         """Return the queries of all models about images of one scene.
 
         Args:
@@ -170,19 +172,19 @@ class Job:
             The queries by ascending number, with the scene's number as the name of the
             problem.
         """
-        scene = numbers.start // self.per_scene
-        images_before = scene * self.per_scene
+        scene = numbers.start // self.images_per_scene
+        images_before = scene * self.images_per_scene
         first_in_scene = numbers.start - images_before
         queries = list[Query]()
-        for size, points in self.bound(scene).items():
-            u = points.configurations(first_in_scene, len(numbers), images_before)
-            descriptions = points.values(u, first_in_scene)
+        for size, points in self.load_points(scene).items():
+            u = points.make_configurations(first_in_scene, len(numbers), images_before)
+            descriptions = points.describe_images(u, first_in_scene)
             for number, configuration, values in zip(
                 numbers, u, descriptions, strict=True
             ):
                 queries += [
                     self._make_query(number, model, points, configuration, values)
-                    for model, model_size in enumerate(self.sizes)
+                    for model, model_size in enumerate(self.image_sizes)
                     if model_size == size
                 ]
         queries.sort(key=lambda query: query.number)
@@ -205,18 +207,18 @@ class Job:
             u: (d,) the configuration.
             values: of the controls.
         """
-        scene = number // self.per_scene
-        environment = points.space.lit_by(values)
+        scene = number // self.images_per_scene
+        environment = points.space.find_environment(values)
         return Query(
             u.clone(),
-            self.seeds(points.noise(number)),
+            self.seeds(points.noise_number(number)),
             KIND,
             number * len(self.models) + model,
             spp=self.spp,
-            drawn=False,
+            draws_conditions=False,
             values=self._row_values(scene, model, environment, values),
-            sought=False,
-            keep=self.config.keep_pictures != "none",
+            has_success=False,
+            with_image=self.config.keep_pictures != "none",
         )
 
     def _row_values(
@@ -234,8 +236,8 @@ class Job:
             environment: what lights the scene instead of its own environment.
             values: of the controls.
         """
-        named_scene = self.places[scene]
-        held_names = {control.name for control in named_scene.held}
+        named_scene = self.scenes[scene]
+        held_names = {control.name for control in named_scene.fixed_controls}
         names = named_scene.names
         if environment is not None:
             names["environment"] = environment
@@ -249,7 +251,7 @@ class Job:
                 row_values[name] = value
         return row_values
 
-    def space(self, named_scene: NamedScene, size: ImageSize) -> Space:
+    def bind_controls(self, named_scene: NamedScene, size: ImageSize) -> Space:
         """Bind the controls, those of the grid as choices, to a scene.
 
         Args:
@@ -260,25 +262,30 @@ class Job:
             InputError: the adversarial configuration does not fit the scene, or a
                 sampled parameter was set.
         """
-        description = framed(named_scene.scene.description, size)
-        controls = (*named_scene.held, *on_grid(self.controls, self.axes, description))
+        description = fit_camera(named_scene.scene.description, size)
+        controls = (
+            *named_scene.fixed_controls,
+            *add_grid_axes(self.controls, self.axes, description),
+        )
         if not controls:
             return Space((), None)
         space = make_space(controls, description)
-        if named_scene.held:
-            held_controls = space.controls[: len(named_scene.held)]
+        if named_scene.fixed_controls:
+            held_controls = space.controls[: len(named_scene.fixed_controls)]
             start = torch.cat([control.start for control in held_controls])
             if named_scene.u is not None and len(named_scene.u) != len(start):
                 raise InputError(
                     "adversarial_of: the adversarial configuration of "
-                    f"{named_scene.beside_clean} has {len(named_scene.u)} "
+                    f"{named_scene.arm} has {len(named_scene.u)} "
                     f"numbers, and {named_scene.object} takes {len(start)}: it is another "
                     "object, or it has changed since; "
                     "do the run again"
                 )
-            space = space.holding(start if named_scene.u is None else named_scene.u)
+            space = space.fix_first_controls(
+                start if named_scene.u is None else named_scene.u
+            )
         for group in space.groups:
-            if group.setting in named_scene.scene.description.given - {ENVIRONMENT}:
+            if group.setting in named_scene.scene.description.requested - {ENVIRONMENT}:
                 raise InputError(
                     f"`controls` {group.control}: draws {group.parameter} by chance, "
                     f"and `set` {group.setting} fixes "
@@ -286,26 +293,26 @@ class Job:
                 )
         return space
 
-    def points(self, space: Space) -> Points:
+    def make_points(self, space: Space) -> Points:
         """Return the configurations of a space.
 
         Scenes with an adversarial configuration have the draws of those without it.
         """
-        is_paired = bool(self.places[0].beside_clean)
+        is_paired = bool(self.scenes[0].arm)
         return Points(
             space,
-            domain_of(space.controls),
+            make_domain(space.controls),
             self.axes,
             self.samples,
             self.config.sampler,
             self.config.seed,
-            len(self.places) // 2 if is_paired else 0,
-            len(self.places),
+            len(self.scenes) // 2 if is_paired else 0,
+            len(self.scenes),
         )
 
-    def facts(self, named_scene: NamedScene, values: Mapping[str, Value]) -> Facts:
+    def make_facts(self, named_scene: NamedScene, values: Mapping[str, Value]) -> Facts:
         """Return what a task needs to know of a scene whose controls have `values`."""
-        return facts_about(
+        return make_facts(
             named_scene.scene.description,
             named_scene.object,
             self.config.label,
@@ -328,7 +335,7 @@ def check_scenes(
     fixed_settings = {
         name
         for named_scene in named_scenes
-        for name in named_scene.scene.description.given
+        for name in named_scene.scene.description.requested
     }
     environment_choices = list[str]()
     for axis in axes:
@@ -342,8 +349,8 @@ def check_scenes(
             )
     for control in controls:
         for parameter in control.parameters:
-            is_varied = parameter.name in control.settings()
-            if control.setting(parameter) == ENVIRONMENT and is_varied:
+            is_varied = parameter.name in control.to_settings()
+            if control.setting_name(parameter) == ENVIRONMENT and is_varied:
                 environment_choices.append(f"`controls` {control.name}")
     environments = list(
         dict.fromkeys(named_scene.environment for named_scene in named_scenes)
@@ -364,10 +371,10 @@ def _find_setting(axis: Axis, controls: Sequence[Control]) -> str:
     if control is None:
         settings = {"kind": axis.control, axis.parameter.name: axis.values[0]}
         control = make_control(axis.instance, settings)
-    return control.setting(axis.parameter)
+    return control.setting_name(axis.parameter)
 
 
-def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
+def check_job(job: Job) -> tuple[Points, tuple[SampledNumber, ...]]:
     """Bind every scene once, so that errors come before anything is rendered.
 
     Returns:
@@ -378,33 +385,33 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
         InputError: controls sample other numbers in one scene than in another.
     """
     points_of_scene = list[tuple[NamedScene, Points]]()
-    for scene, named_scene in enumerate(job.places):
+    for scene, named_scene in enumerate(job.scenes):
         points_of_scene += [
-            (named_scene, points) for points in job.bound(scene).values()
+            (named_scene, points) for points in job.load_points(scene).values()
         ]
-        facts = job.facts(named_scene, {})
+        facts = job.make_facts(named_scene, {})
         for task, model in zip(job.tasks, job.models, strict=True):
             check_truth(
                 task, model, named_scene.scene, facts, job.config.image_settings
             )
     first_points = points_of_scene[0][1]
     for named_scene, points in points_of_scene:
-        if points.drawn_numbers != first_points.drawn_numbers:
+        if points.sampled_layout != first_points.sampled_layout:
             raise InputError(
                 f"`object` {named_scene.object}: its controls draw other numbers than "
-                f"those of {job.places[0].object}; sweep "
+                f"those of {job.scenes[0].object}; sweep "
                 "the two by themselves"
             )
     sampled = [
-        _merge_versions(versions, first_points.parts)
+        _merge_versions(versions, first_points.n_parts)
         for versions in zip(
-            *(points.drawn for _, points in points_of_scene), strict=True
+            *(points.sampled_numbers for _, points in points_of_scene), strict=True
         )
     ]
     return first_points, tuple(sampled)
 
 
-def _merge_versions(versions: Sequence[Drawn], n_parts: int) -> Drawn:
+def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledNumber:
     """Return a sampled number as the table of all scenes shows it.
 
     Args:
@@ -415,7 +422,9 @@ def _merge_versions(versions: Sequence[Drawn], n_parts: int) -> Drawn:
     if all(version.parts == number.parts for version in versions):
         return number
     fractions = tuple([k / n_parts, (k + 1) / n_parts] for k in range(n_parts))
-    return replace(number, unit="of its range", parts=fractions, settled=False)
+    return replace(
+        number, unit="of its range", parts=fractions, same_in_all_scenes=False
+    )
 
 
 class SweptScene:
@@ -429,20 +438,20 @@ class SweptScene:
         points: its configurations.
         renderers: its renderers.
         problems: one for each model.
-        predicted: what predicts its images.
+        predictors: what predicts its images.
     """
 
     def __init__(self, job: Job, number: int) -> None:
-        named_scene = job.places[number]
+        named_scene = job.scenes[number]
         config = job.config
         self.number = number
         self.job = job
-        self.points = job.bound(number)
+        self.points = job.load_points(number)
         # render the scene without its object
         self._empty_renderers: dict[ImageSize, Renderer] = {}
         self.renderers = {size: self._make_renderer(size) for size in self.points}
         facts = partial(
-            facts_about,
+            make_facts,
             named_scene.scene.description,
             named_scene.object,
             config.label,
@@ -460,13 +469,15 @@ class SweptScene:
                 config.seed,
                 metrics=job.metrics,
             )
-            for size, model, task in zip(job.sizes, job.models, job.tasks, strict=True)
+            for size, model, task in zip(
+                job.image_sizes, job.models, job.tasks, strict=True
+            )
         )
         light_seed = seeds.stream(config.seed, "sweep light", number)
-        self.predicted = dict[ImageSize, PredictedSweep]()
+        self.predictors = dict[ImageSize, SweepPredictor]()
         for size, points in self.points.items():
-            self.predicted[size] = PredictedSweep(
-                self.problems[job.sizes.index(size)],
+            self.predictors[size] = SweepPredictor(
+                self.problems[job.image_sizes.index(size)],
                 points,
                 job.axes,
                 light_seed,
@@ -475,14 +486,14 @@ class SweptScene:
             )
 
     @property
-    def not_finite(self) -> int:
+    def n_non_finite(self) -> int:
         """Values of images that were not finite, and were set to 0."""
         rendered = sum(renderer.non_finite for renderer in self.renderers.values())
-        predicted = sum(images.not_finite for images in self.predicted.values())
+        predicted = sum(images.n_non_finite for images in self.predictors.values())
         return rendered + predicted
 
     def evaluate_all(
-        self, queries: Sequence[Query], prepared: Prepared | None = None
+        self, queries: Sequence[Query], prepared: Preparation | None = None
     ) -> list[Evaluation]:
         """Evaluate queries of neighbouring rows.
 
@@ -493,7 +504,7 @@ class SweptScene:
             prepared: nothing; sweeps prepare nothing.
         """
         begin = time.perf_counter()
-        not_finite_before = self.not_finite
+        not_finite_before = self.n_non_finite
         n_models = len(self.job.models)
         images = {size: self._make_images(size, queries) for size in self.points}
         judgements = self._judge(queries, images)
@@ -506,11 +517,11 @@ class SweptScene:
         evaluations = list[Evaluation]()
         for query in queries:
             number, model = divmod(query.number, n_models)
-            image = images[self.job.sizes[model]][number]
-            evaluation = Evaluation.of(
+            image = images[self.job.image_sizes[model]][number]
+            evaluation = Evaluation.from_judgement(
                 judgements[query.number],
-                cost=image.traced * self.job.first_of_size[model],
-                predicted=image.predicted,
+                cost=image.n_traced * self.job.is_first_of_size[model],
+                predicted=image.prediction_spp,
                 seconds=seconds,
             )
             if model == 0:
@@ -520,15 +531,15 @@ class SweptScene:
         # What concerns the batch stands in its last evaluation.
         evaluations[-1] = replace(
             evaluations[-1],
-            light=[predictor.summary() for predictor in self.predicted.values()],
-            non_finite=max(0, self.not_finite - not_finite_before),
+            light=[predictor.summarize() for predictor in self.predictors.values()],
+            non_finite=max(0, self.n_non_finite - not_finite_before),
         )
         return evaluations
 
     def _judge(
         self,
         queries: Sequence[Query],
-        images: Mapping[ImageSize, Mapping[int, SweptPicture]],
+        images: Mapping[ImageSize, Mapping[int, SweptImage]],
     ) -> dict[int, Judgement]:
         """Return the judgements of all queries by their numbers.
 
@@ -540,7 +551,7 @@ class SweptScene:
         n_models = len(job.models)
         judgements: dict[int, Judgement] = {}
         for model, problem in enumerate(self.problems):
-            size = job.sizes[model]
+            size = job.image_sizes[model]
             model_queries = [
                 query for query in queries if query.number % n_models == model
             ]
@@ -548,11 +559,11 @@ class SweptScene:
                 continue
             batch = torch.stack(
                 [
-                    images[size][query.number // n_models].picture
+                    images[size][query.number // n_models].image
                     for query in model_queries
                 ]
             )
-            judged = problem.judge_several(
+            judged = problem.judge_images(
                 batch,
                 [query.u for query in model_queries],
                 [query.values for query in model_queries],
@@ -563,7 +574,7 @@ class SweptScene:
         return judgements
 
     def _attach_images(
-        self, evaluation: Evaluation, query: Query, image: SweptPicture, is_wrong: bool
+        self, evaluation: Evaluation, query: Query, image: SweptImage, is_wrong: bool
     ) -> Evaluation:
         """Return an evaluation of the first model with the images that are stored.
 
@@ -574,16 +585,16 @@ class SweptScene:
             is_wrong: whether the prediction of any model is wrong.
         """
         job = self.job
-        if query.keep and (job.config.keep_pictures == "all" or is_wrong):
-            thumbnail = thumbnails.thumbnail(image.picture)
-            evaluation = replace(evaluation, small=thumbnail)
+        if query.with_image and (job.config.keep_pictures == "all" or is_wrong):
+            thumbnail = thumbnails.make_thumbnail(image.image)
+            evaluation = replace(evaluation, jpeg=thumbnail)
         if job.aovs:
-            surfaces = self.renderers[job.sizes[0]].surfaces(query.u)
+            surfaces = self.renderers[job.image_sizes[0]].surfaces(query.u)
             layers = {
                 name: layer.numpy()
-                for name, layer in surfaces.layers(job.aovs, OBJECT).items()
+                for name, layer in surfaces.make_layers(job.aovs, OBJECT).items()
             }
-            notes = surfaces.notes(job.aovs)
+            notes = surfaces.describe_layers(job.aovs)
             evaluation = replace(evaluation, layers=(layers, notes))
         return evaluation
 
@@ -611,19 +622,22 @@ class SweptScene:
         configurations = [query.u for query in queries]
         values = [query.values for query in queries]
         for claim, change in self.job.config.claims:
-            if change == AWAY:
+            if change == WITHOUT_OBJECT:
                 changed_images = self._render_empty(size, queries)
             else:
                 changed_images = torch.stack(
-                    [changed(image, change, problem.model.cameras) for image in images]
+                    [
+                        change_image(image, change, problem.model.cameras)
+                        for image in images
+                    ]
                 )
-            changed_judged = problem.judge_several(
+            changed_judged = problem.judge_images(
                 changed_images, configurations, values
             )
             for index, (before, after) in enumerate(
                 zip(judged, changed_judged, strict=True)
             ):
-                is_claimed = as_claimed(claim, before.prediction, after.prediction)
+                is_claimed = meets_claim(claim, before.prediction, after.prediction)
                 metrics = {
                     **(before.metrics or {}),
                     f"{claim} {change}": float(is_claimed),
@@ -640,14 +654,14 @@ class SweptScene:
         if size not in self._empty_renderers:
             self._empty_renderers[size] = self._make_renderer(size)
         renderer = self._empty_renderers[size]
-        renderer.scene.assembly.away = True
+        renderer.scene.assembly.is_object_hidden = True
         with torch.no_grad():
             rendered = [renderer(query.u, query.seed, query.spp) for query in queries]
-        return torch.stack(list(map(to_8_bit, rendered)))
+        return torch.stack(list(map(round_to_8_bit, rendered)))
 
     def _make_renderer(self, size: ImageSize) -> Renderer:
         config = self.job.config
-        description = framed(self.job.places[self.number].scene.description, size)
+        description = fit_camera(self.job.scenes[self.number].scene.description, size)
         return make_renderer(
             description,
             self.points[size].space,
@@ -659,62 +673,62 @@ class SweptScene:
 
     def _make_images(
         self, size: ImageSize, queries: Sequence[Query]
-    ) -> dict[int, SweptPicture]:
+    ) -> dict[int, SweptImage]:
         """Return the images of one size, rounded to 8 bits, by their numbers."""
         n_models = len(self.job.models)
         images_before = self.number * self.points[size].count
         query_of_image = {
             query.number // n_models - images_before: query
             for query in queries
-            if self.job.sizes[query.number % n_models] == size
+            if self.job.image_sizes[query.number % n_models] == size
         }
         with torch.no_grad():
-            images = self.predicted[size].pictures(query_of_image)
+            images = self.predictors[size].make_images(query_of_image)
         return {
-            images_before + number: replace(image, picture=to_8_bit(image.picture))
+            images_before + number: replace(image, image=round_to_8_bit(image.image))
             for number, image in images.items()
         }
 
-    def picture(self, query: Query) -> Tensor:
+    def render_image(self, query: Query) -> Tensor:
         """Return the image (H, W, 3) of a query to the first model."""
-        (image,) = self._make_images(self.job.sizes[0], [query]).values()
-        return image.picture
+        (image,) = self._make_images(self.job.image_sizes[0], [query]).values()
+        return image.image
 
 
-class OpenScenes:
+class SceneLoader:
     """Loads the scenes of a sweep in this process; the last one is cached."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
         self.scene: SweptScene | None = None
 
-    def open(self, number: int) -> SweptScene:
+    def load(self, number: int) -> SweptScene:
         """Load the scene with this number, and release the one before."""
         if self.scene is None or self.scene.number != number:
             self.scene = None
             self.scene = SweptScene(self.job, number)
         return self.scene
 
-    def named(self, name: str) -> SweptScene:
+    def load_by_name(self, name: str) -> SweptScene:
         """Load a scene by its number as text.
 
-        That is the name of its problem: see `advsearch.engine.journal.worker_call`.
+        That is the name of its problem: see `advsearch.engine.journal.make_worker_call`.
         """
-        return self.open(int(name))
+        return self.load(int(name))
 
-    def asked(self, number: int) -> tuple[SweptScene, list[Query]]:
+    def make_queries(self, number: int) -> tuple[SweptScene, list[Query]]:
         """Load the scene of an image; return it and the queries of all models."""
-        sent = self.job.queries(range(number, number + 1))
-        return self.named(str(sent[0][0])), [query for _, _, query in sent]
+        sent = self.job.make_queries(range(number, number + 1))
+        return self.load_by_name(str(sent[0][0])), [query for _, _, query in sent]
 
-    def picture(self, number: int) -> Tensor:
+    def render_image(self, number: int) -> Tensor:
         """Render an image (H, W, 3) as the first model gets it."""
-        scene, (query, *_) = self.asked(number)
-        return scene.picture(query)
+        scene, (query, *_) = self.make_queries(number)
+        return scene.render_image(query)
 
-    def thumbnail(self, number: int) -> bytes:
+    def render_thumbnail(self, number: int) -> bytes:
         """Render an image as the first model gets it, as a small JPEG."""
-        return thumbnails.thumbnail(self.picture(number))
+        return thumbnails.make_thumbnail(self.render_image(number))
 
     def find_features(self) -> Features:
         """Find the layer whose features the first model decides by.
@@ -729,7 +743,7 @@ class OpenScenes:
         return features_of(self.job.models[0])
 
 
-def check_worst(
+def verify_worst(
     problem: Problem,
     config: SweepConfig,
     u: Tensor,
@@ -752,21 +766,25 @@ def check_worst(
     """
     if config.trials == 0:
         return None
-    ladder = ladder_of(config.verify_spp, config.pixel_sampler)
-    verifier = Verifier(Journal(run, Shared(problem)), ladder, stages, sought=False)
+    ladder = choose_ladder(config.verify_spp, config.pixel_sampler)
+    verifier = Verifier(
+        Journal(run, ParallelEvaluator(problem)), ladder, stages, has_success=False
+    )
     verifier.choose_spp({"worst": u})
-    verifier.begin("checking the worst configuration with fresh renders", config.trials)
-    spp = verifier.findings.spp
-    sample_count = verifier.findings.sample_count
+    verifier.begin_stage(
+        "checking the worst configuration with fresh renders", config.trials
+    )
+    spp = verifier.state.spp
+    sample_count = verifier.state.sample_count
     trials = run_trials(
         verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials
     )
     wrong_trials = [trial for trial in trials if trial.success]
     counts = Trials(len(wrong_trials), len(trials), spp)
-    verified_rate = rate_of(counts, trials, wrong_trials)
+    verified_rate = make_rate(counts, trials, wrong_trials)
     has_converged = sample_count is not None and sample_count.converged
     return WorstVerified(
         **vars(verified_rate),
         converged=len(verifier.ladder) == 1 or has_converged,
-        renders=verifier.findings.verification_renders,
+        renders=verifier.state.verification_renders,
     )

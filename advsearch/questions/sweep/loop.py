@@ -18,32 +18,44 @@ import numpy.typing as npt
 from torch import Tensor
 
 from advsearch.attacks import Evaluation, Query
-from advsearch.attacks.domain import batches
+from advsearch.attacks.domain import split_into_batches
 from advsearch.cluster import InProcess, Workers
-from advsearch.engine.journal import Journal, Sent, Shared, lost, worker_call
-from advsearch.engine.loading import framed
+from advsearch.engine.journal import (
+    Journal,
+    ParallelEvaluator,
+    WorkItem,
+    make_lost_evaluation,
+    make_worker_call,
+)
+from advsearch.engine.loading import fit_camera
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import LOST, judgement_of, lost_remarks
+from advsearch.engine.record import LOST_LABEL, make_lost_remarks, read_judgement
 from advsearch.interrupts import interruptible
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress, Stages
-from advsearch.questions.attack.result import save_marked
-from advsearch.questions.sweep.display import sweep_figure
-from advsearch.questions.sweep.drives import Drives, time_axis
-from advsearch.questions.sweep.job import KIND, Job, OpenScenes, check_all, check_worst
+from advsearch.questions.attack.result import save_with_marks
+from advsearch.questions.sweep.display import draw_sweep
+from advsearch.questions.sweep.drives import Drives, find_time_axis
+from advsearch.questions.sweep.job import (
+    KIND,
+    Job,
+    SceneLoader,
+    check_job,
+    verify_worst,
+)
 from advsearch.questions.sweep.page import write_sweep_page
-from advsearch.questions.sweep.predicting import combined
+from advsearch.questions.sweep.predicting import combine_transport
 from advsearch.questions.sweep.result import (
     FINISHED,
     Predictions,
     SweepResult,
-    SweptAxis,
-    counted_by_unit,
-    map_over,
+    TableAxis,
+    count_by_unit,
+    make_map,
 )
 from advsearch.questions.sweep.settings import BLIND
 from advsearch.questions.sweep.summary import (
-    BesideClean,
+    ArmComparison,
     ChangeRates,
     DriveRates,
     SurfaceMap,
@@ -65,7 +77,7 @@ from advsearch.runs.results import (
 )
 from advsearch.runs.store import Row
 from advsearch.runs.tables import EDGES, NOTE
-from advsearch.statistics.clustered import most_shown
+from advsearch.statistics.clustered import max_lower_bound
 from advsearch.tasks import Judgement
 from advsearch.trust.writing import write_bytes
 from advsearch.viewer import thumbnails
@@ -92,10 +104,10 @@ class Sweep:
 
     Attributes:
         points: the configurations of the first scene.
-        per_scene: images of a scene.
-        models: how many there are.
+        images_per_scene: images of a scene.
+        n_models: how many there are.
         units: how rows follow from draws.
-        total: rows of the full sweep.
+        n_rows: rows of the full sweep.
     """
 
     def __init__(
@@ -109,11 +121,11 @@ class Sweep:
         self.run = run
         self.stages = Stages(progress)
         self.stages.begin("setup", "preparing the scenes for rendering")
-        self.points, self._sampled_numbers = check_all(job)
-        self.per_scene = self.points.count
-        self.models = len(job.models)
-        self.units = replace(self.points.units, models=self.models)
-        self.total = len(job.places) * self.per_scene * self.models
+        self.points, self._sampled_numbers = check_job(job)
+        self.images_per_scene = self.points.count
+        self.n_models = len(job.models)
+        self.units = replace(self.points.units, models=self.n_models)
+        self.n_rows = len(job.scenes) * self.images_per_scene * self.n_models
         if run is not None:
             edges = {
                 number.name: number.edges
@@ -122,12 +134,14 @@ class Sweep:
             }
             run.store.set_note(EDGES, json.dumps(edges))
             run.store.set_note(NOTE, json.dumps(asdict(self.units)))
-        self._scenes = OpenScenes(job)
+        self._scenes = SceneLoader(job)
         if executor is None:
-            self._executor: Workers = InProcess(worker_call(self._scenes.named))
+            self._executor: Workers = InProcess(
+                make_worker_call(self._scenes.load_by_name)
+            )
         else:
             self._executor = executor
-        self.journal = Journal(run, Shared(None, executor))
+        self.journal = Journal(run, ParallelEvaluator(None, executor))
         self._n_rendered = 0  # images, by this process or its workers
         self._n_traced = 0  # images of the full sweep, as its rows state them
         self._n_predicted = 0
@@ -143,7 +157,7 @@ class Sweep:
         self._surface: SurfaceMap | None = None
         self._drives: list[DriveRates] | None = None
 
-    def carry_out(self, first: int | None = None) -> SweepResult:
+    def execute(self, first: int | None = None) -> SweepResult:
         """Evaluate the rows that are missing, and return the result.
 
         Args:
@@ -156,11 +170,11 @@ class Sweep:
         try:
             with interruptible():
                 if first is not None:
-                    missing = [range(first, self.total)]
+                    missing = [range(first, self.n_rows)]
                 else:
                     missing = self._find_missing()
-                first_row = missing[0].start if missing else self.total - 1
-                self._scenes.open(self._scene_of(first_row))
+                first_row = missing[0].start if missing else self.n_rows - 1
+                self._scenes.load(self._scene_of(first_row))
                 self._evaluate_rows(missing, predictions)
                 worst = self._find_worst(predictions, verify=True)
                 self._map_surface()
@@ -176,42 +190,44 @@ class Sweep:
         """Map wrong predictions over the surface, if that was requested."""
         if not self.job.config.surface or self.run is None:
             return
-        self.stages.begin("surface", "tracing the surface that was seen", self.total)
+        self.stages.begin("surface", "tracing the surface that was seen", self.n_rows)
         self._surface = map_surface(
-            self._scenes, self.rows(), self.run, self.stages.progress
+            self._scenes, self.iterate_rows(), self.run, self.stages.progress
         )
 
     def _analyze_drives(self) -> None:
         """Compute the rates over drives, if the frames of a path are swept."""
-        if time_axis(self.job.axes) is None:
+        if find_time_axis(self.job.axes) is None:
             return
         self.stages.begin("drives", "rendering the frames of the worst drive")
-        drives = Drives(self.job, self.rows())
+        drives = Drives(self.job, self.iterate_rows())
         if self.run is not None:
-            drives.keep_worst(self._scenes, self.run)
-        self._drives = drives.rates()
+            drives.save_worst(self._scenes, self.run)
+        self._drives = drives.compute_rates()
 
     def _scene_of(self, row: int) -> int:
-        return row // self.models // self.per_scene
+        return row // self.n_models // self.images_per_scene
 
     def _find_missing(self) -> list[range]:
         """Return the numbers of the rows that are not stored."""
         if self.run is None:
-            return [range(self.total)]
-        return list(self.run.store.missing(KIND, self.total))
+            return [range(self.n_rows)]
+        return list(self.run.store.missing(KIND, self.n_rows))
 
     def _evaluate_rows(
         self, missing: Sequence[range], predictions: Predictions
     ) -> None:
         """Evaluate rows in batches; store and count what is predicted."""
         title = "rendering and classifying"
-        self.stages.begin("sweep", title, self.total, hint=self._sweep_hint())
-        self.stages.progress.advance(self.total - sum(map(len, missing)))
+        self.stages.begin("sweep", title, self.n_rows, hint=self._sweep_hint())
+        self.stages.progress.advance(self.n_rows - sum(map(len, missing)))
         self._sweep_begin = time.monotonic()
-        for done in self._executor.results(self._make_batches(missing)):
+        for done in self._executor.compute(self._make_batches(missing)):
             queries = [query for *_, query in done.items]
             if done.lost:
-                evaluations = [lost(query, done.lost) for query in queries]
+                evaluations = [
+                    make_lost_evaluation(query, done.lost) for query in queries
+                ]
             else:
                 evaluations = done.value
             evaluations = [
@@ -219,34 +235,35 @@ class Sweep:
             ]
             evaluated = list(zip(queries, evaluations, strict=True))
             self._save_images(evaluated)
-            self._add_costs(self.journal.keep(evaluated, numbered=True))
+            self._add_costs(self.journal.store(evaluated, id_is_number=True))
             self._n_rendered += sum(
-                self.job.first_of_size[query.number % self.models] for query in queries
+                self.job.is_first_of_size[query.number % self.n_models]
+                for query in queries
             )
             scene = self._scene_of(queries[0].number)
             self._transport[done.worker, scene] = evaluations[-1].light or []
             if any(evaluation.non_finite for evaluation in evaluations):
                 self._note_non_finite()
             for query, evaluation in evaluated:
-                predictions.add(query.number, evaluation.said)
+                predictions.add(query.number, evaluation.required_judgement)
             self._report(len(queries), predictions)
         self.journal.rows.sort(key=lambda row: row.step)
 
     def _sweep_hint(self) -> str:
         """Return what the progress says of the work ahead."""
         hint = (
-            f"{self.total} predictions, pictures of "
+            f"{self.n_rows} predictions, pictures of "
             f"{count(self.job.spp, 'sample')} "
             "a pixel; `resolution`, `spp` or fewer points shorten it"
         )
         keep = self.job.config.keep_pictures
         if self.run is None or keep == "none":
             return hint
-        height, width = self.job.sizes[0]
-        scale = min(1.0, thumbnails.SIDE / max(height, width))
-        size_fraction = scale**2 * height * width / thumbnails.SIDE**2
-        n_images = self.total // self.models
-        megabytes = n_images * thumbnails.BYTES * size_fraction / 1e6
+        height, width = self.job.image_sizes[0]
+        scale = min(1.0, thumbnails.THUMBNAIL_SIZE / max(height, width))
+        size_fraction = scale**2 * height * width / thumbnails.THUMBNAIL_SIZE**2
+        n_images = self.n_rows // self.n_models
+        megabytes = n_images * thumbnails.TYPICAL_BYTES * size_fraction / 1e6
         if megabytes >= 1e3:
             size = f"{megabytes / 1e3:.1f} GB"
         else:
@@ -259,9 +276,9 @@ class Sweep:
         if self.run is None:
             return
         for query, evaluation in evaluated:
-            number = query.number // self.models
-            if evaluation.small is not None:
-                thumbnails.keep(self.run.path, number, evaluation.small)
+            number = query.number // self.n_models
+            if evaluation.jpeg is not None:
+                thumbnails.write_thumbnail(self.run.path, number, evaluation.jpeg)
             if evaluation.layers is not None:
                 file = self.run.path / AOV_FOLDER / f"{number:06d}.exr"
                 write_layers(file, *evaluation.layers)
@@ -274,7 +291,7 @@ class Sweep:
         if self.run is not None:
             self.run.store.set_note(NOT_FINITE, "yes")
 
-    def _make_batches(self, missing: Sequence[range]) -> Iterator[list[Sent]]:
+    def _make_batches(self, missing: Sequence[range]) -> Iterator[list[WorkItem]]:
         """Yield the queries of missing rows in batches, none over two scenes.
 
         A batch begins at a multiple of its size in the scene, whatever is missing, so
@@ -282,17 +299,17 @@ class Sweep:
         """
         batch_size = self.job.config.batch
         for rows in missing:
-            image = rows.start // self.models
-            last_image = -(-rows.stop // self.models)  # rounded up
+            image = rows.start // self.n_models
+            last_image = -(-rows.stop // self.n_models)  # rounded up
             while image < last_image:
-                scene_begin = image // self.per_scene * self.per_scene
-                images = batches(
+                scene_begin = image // self.images_per_scene * self.images_per_scene
+                images = split_into_batches(
                     image - scene_begin,
-                    min(last_image - scene_begin, self.per_scene),
+                    min(last_image - scene_begin, self.images_per_scene),
                     batch_size,
                 )
                 for batch in images:
-                    queries = self.job.queries(
+                    queries = self.job.make_queries(
                         range(scene_begin + batch.start, scene_begin + batch.stop)
                     )
                     yield [
@@ -300,7 +317,7 @@ class Sweep:
                         for sent in queries
                         if rows.start <= sent[2].number < rows.stop
                     ]
-                image = scene_begin + self.per_scene
+                image = scene_begin + self.images_per_scene
 
     def _report(self, n_rows: int, predictions: Predictions) -> None:
         """Report progress by some rows, at most every `REPORT_SECONDS`."""
@@ -309,82 +326,82 @@ class Sweep:
         if now - self._last_report < REPORT_SECONDS:
             return
         values = dict[str, float | str]()
-        n_counted = int(predictions.counted.sum())
+        n_counted = int(predictions.is_counted.sum())
         if n_counted:
-            n_right = int((predictions.right & predictions.counted).sum())
+            n_right = int((predictions.is_right & predictions.is_counted).sum())
             values["accuracy"] = n_right / n_counted
-        facts = self._executor.facts
+        facts = self._executor.stats
         if facts is not None:
             seconds = max(1e-9, now - self._sweep_begin)
-            values |= {**facts.told, "a second": self._n_rendered / seconds}
+            values |= {**facts.progress_counts, "a second": self._n_rendered / seconds}
         self.stages.progress.advance(self._n_unreported, **values)
         self._last_report = now
         self._n_unreported = 0
 
     def _read_predictions(self) -> Predictions:
         """Read the predictions of all rows so far, and count their costs anew."""
-        predictions = Predictions(self.total)
+        predictions = Predictions(self.n_rows)
         self._n_traced = 0
         self._n_predicted = 0
         self._n_lost = 0
-        for row in self.rows():
-            predictions.add(row.step, judgement_of(row))
+        for row in self.iterate_rows():
+            predictions.add(row.step, read_judgement(row))
             self._add_costs([row])
         return predictions
 
-    def rows(self) -> Iterable[Row]:
+    def iterate_rows(self) -> Iterable[Row]:
         """Return all rows so far."""
         return self.journal.rows if self.run is None else self.run.store.rows(KIND)
 
     def _add_costs(self, rows: Sequence[Row]) -> None:
         """Count the images that rows took."""
         for row in rows:
-            is_first = self.job.first_of_size[row.step % self.models]
+            is_first = self.job.is_first_of_size[row.step % self.n_models]
             # Rows of old versions don't state their renders.
             self._n_traced += int(is_first) if row.renders is None else row.renders
             self._n_predicted += row.seed is None and is_first
-            self._n_lost += row.label == LOST
+            self._n_lost += row.label == LOST_LABEL
 
-    def _make_axes(self, rows: npt.NDArray[np.int64]) -> list[SweptAxis]:
+    def _make_axes(self, rows: npt.NDArray[np.int64]) -> list[TableAxis]:
         """Return what tables are by: all axes with several values.
 
         Args:
             rows: (n,) numbers of the rows, ascending, whose values are looked up.
         """
-        image, model = np.divmod(rows, self.models)
-        scene, image_in_scene = np.divmod(image, self.per_scene)
+        image, model = np.divmod(rows, self.n_models)
+        scene, image_in_scene = np.divmod(image, self.images_per_scene)
         model_names = [network.name for network in self.job.models]
         axes = [
             *self._scene_axes(scene),
-            SweptAxis("model", "", model_names, model),
+            TableAxis("model", "", model_names, model),
             *self._grid_axes(image_in_scene),
         ]
         if self._sampled_numbers and len(rows):
             parts = self._find_parts(image)
             axes += [
-                SweptAxis(number.name, number.unit, number.parts, index, "drawn")
+                TableAxis(number.name, number.unit, number.parts, index, "drawn")
                 for number, index in zip(self._sampled_numbers, parts.T, strict=True)
             ]
         return [axis for axis in axes if len(axis.values) > 1]
 
-    def _scene_axes(self, scene: npt.NDArray[np.int64]) -> Iterator[SweptAxis]:
+    def _scene_axes(self, scene: npt.NDArray[np.int64]) -> Iterator[TableAxis]:
         """Yield the axes over scenes; `scene` (n,) has the scene of each row."""
         for name in ("object", "environment", "answer"):
             scene_values = [
-                named_scene.names.get(name, "") for named_scene in self.job.places
+                named_scene.names.get(name, "") for named_scene in self.job.scenes
             ]
             values = list(dict.fromkeys(scene_values))
             index_of_scene = np.array([values.index(value) for value in scene_values])
-            yield SweptAxis(name, "", values, index_of_scene[scene])
+            yield TableAxis(name, "", values, index_of_scene[scene])
 
-    def _grid_axes(self, image: npt.NDArray[np.int64]) -> list[SweptAxis]:
+    def _grid_axes(self, image: npt.NDArray[np.int64]) -> list[TableAxis]:
         """Return the axes of the grid; `image` (n,) is numbered in the scene."""
         if not self.job.axes:
             return []
         grid_point = image // self.job.samples
         indices = np.unravel_index(grid_point, self.points.grid.sizes)
         return [
-            SweptAxis(axis.name, axis.unit, axis.values, index, "grid")
+            TableAxis(axis.name, axis.unit, axis.values, index, "grid")
             for axis, index in zip(self.job.axes, indices, strict=True)
         ]
 
@@ -396,11 +413,11 @@ class Sweep:
         """
         last_image = int(images[-1])
         parts = list[npt.NDArray[np.int64]]()
-        for scene_begin in range(0, last_image + 1, self.per_scene):
-            scene_end = scene_begin + self.per_scene
-            for batch in batches(scene_begin, scene_end, SAMPLING_BATCH):
+        for scene_begin in range(0, last_image + 1, self.images_per_scene):
+            scene_end = scene_begin + self.images_per_scene
+            for batch in split_into_batches(scene_begin, scene_end, SAMPLING_BATCH):
                 if batch.start <= last_image:
-                    parts.append(self.points.parts_of(batch.start, len(batch)))
+                    parts.append(self.points.find_parts(batch.start, len(batch)))
         return np.asarray(np.concatenate(parts)[images])
 
     def _find_worst(
@@ -412,15 +429,15 @@ class Sweep:
             predictions: of all rows.
             verify: also renders it again, and saves its image.
         """
-        row_number = predictions.worst
+        row_number = predictions.worst_row
         if row_number is None:
             return None
         rows: Iterable[Row | None] = self.journal.rows
         if self.run is not None:
             rows = [self.run.store.row(KIND, row_number)]
         row = next(row for row in rows if row is not None and row.step == row_number)
-        image, model = divmod(row_number, self.models)
-        query = self.job.queries(range(image, image + 1))[model][2]
+        image, model = divmod(row_number, self.n_models)
+        query = self.job.make_queries(range(image, image + 1))[model][2]
         scene = self._scene_of(row_number)
         worst = WorstConfiguration(
             configuration=row_number,
@@ -429,22 +446,24 @@ class Sweep:
             },
             seed=query.seed,
             label_set=self._find_right_labels(scene, model, query),
-            claimed=_to_claim(judgement_of(row)),
+            claimed=_to_claim(read_judgement(row)),
             verified=None,
         )
         if not verify:
             return worst
-        problem = self._scenes.open(scene).problems[model]
+        problem = self._scenes.load(scene).problems[model]
         return self._verify_worst(worst, problem, query.u)
 
     def _find_right_labels(self, scene: int, model: int, query: Query) -> list[str]:
         """Return the names that count as right in the image of a query."""
         task = self.job.tasks[model]
         if task.varies:
-            problem = self._scenes.open(scene).problems[model]
-            truth = problem.truth(query.u, query.values)
+            problem = self._scenes.load(scene).problems[model]
+            truth = problem.find_truth(query.u, query.values)
         else:
-            truth = task.truth(self.job.facts(self.job.places[scene], query.values))
+            truth = task.truth(
+                self.job.make_facts(self.job.scenes[scene], query.values)
+            )
         return list(task.truth_names(truth))
 
     def _verify_worst(
@@ -457,13 +476,13 @@ class Sweep:
             problem: of its scene and model.
             u: (d,) the configuration.
         """
-        verified = check_worst(problem, self.job.config, u, self.run, self.stages)
+        verified = verify_worst(problem, self.job.config, u, self.run, self.stages)
         if self.run is None:
             return worst.model_copy(update={"verified": verified})
         verified_spp = verified.spp if verified else 0
         image = problem.picture(u, worst.seed, max(SAVED_IMAGE_SPP, verified_spp))
         self.run.save_image("worst", image)
-        save_marked(self.run, "worst", image, problem.marks(image, u))
+        save_with_marks(self.run, "worst", image, problem.find_marks(image, u))
         pictured = _to_claim(problem.judge(image, u))
         return worst.model_copy(update={"verified": verified, "pictured": pictured})
 
@@ -473,7 +492,7 @@ class Sweep:
         """Summarize the sweep, write its files, and return the result."""
         summary = self._summarize(predictions, ending, worst)
         if self.run is not None:
-            for suffix, data in sweep_figure(summary).items():
+            for suffix, data in draw_sweep(summary).items():
                 write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
             write_sweep_page(self.run.path, summary)
             # The summary comes last: without a page the run has not finished.
@@ -491,8 +510,8 @@ class Sweep:
         seconds = self.stages.seconds
         verified = worst.verified if worst else None
         formation, gains = self._describe_formation()
-        rows = np.flatnonzero(predictions.counted)
-        right = predictions.right[rows]
+        rows = np.flatnonzero(predictions.is_counted)
+        right = predictions.is_right[rows]
         units = self.units.of(rows)
         axes = self._make_axes(rows)
         outcome = predictions.outcome[rows]
@@ -502,33 +521,37 @@ class Sweep:
             object=config.object,
             model=",".join(model.name for model in job.models),
             task=config.task_name,
-            environment=self.points.environment or config.lit_by,
+            environment=self.points.environment or config.environment_name,
             controls=[control.name for control in job.controls],
             ending=ending,
             image_formation=formation,
             gains=gains if len(gains) > 1 else None,
-            drawn={number.name: number.varied for number in self._sampled_numbers},
-            planned=self.total,
-            **vars(counted_by_unit(right, units, outcome)),
-            out_of_view=int(predictions.hidden.sum()),
-            phantoms_out_of_view=predictions.phantoms_out_of_view,
+            drawn={
+                number.name: number.varied_value for number in self._sampled_numbers
+            },
+            planned=self.n_rows,
+            **vars(count_by_unit(right, units, outcome)),
+            out_of_view=int(predictions.is_hidden.sum()),
+            phantoms_out_of_view=predictions.n_phantoms_out_of_view,
             units=len(np.unique(units)) if self.units.size > 1 and len(units) else None,
-            not_finite=predictions.not_finite,
-            answers=predictions.frequent,
-            axes=[row for axis in axes for row in axis.rows(right, units, outcome)],
-            cells=map_over(axes, right, predictions.margin[rows]),
+            not_finite=predictions.n_non_finite,
+            answers=predictions.frequent_wrong_labels,
+            axes=[
+                row for axis in axes for row in axis.make_rows(right, units, outcome)
+            ],
+            cells=make_map(axes, right, predictions.margin[rows]),
             beside=self._compare_arms(predictions),
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
-            sampler=config.sampler if self.points.draws else None,
+            sampler=config.sampler if self.points.is_sampled else None,
             spp=job.spp,
             renders=self._count_renders(verified),
             transport=self._combine_transport(),
             surface=self._surface,
             drives=self._drives,
             changes=changes or None,
-            shared=SharedWork.of_facts(self._executor.facts, self.journal.machines),
+            shared=SharedWork.of_facts(self._executor.stats, self.journal.machines),
             renders_per_second=self._compute_speed(seconds.get("sweep", 0.0)),
             seconds={**seconds, "total": self.stages.total},
             seed=config.seed,
@@ -548,9 +571,11 @@ class Sweep:
             return None, gains
         renderer = next(iter(self._scenes.scene.renderers.values()))
         formation = Formation.of(renderer.formation)
-        if len(self.job.places) <= MAX_LISTED_GAINS:
-            for named_scene in self.job.places:
-                description = framed(named_scene.scene.description, self.job.sizes[0])
+        if len(self.job.scenes) <= MAX_LISTED_GAINS:
+            for named_scene in self.job.scenes:
+                description = fit_camera(
+                    named_scene.scene.description, self.job.image_sizes[0]
+                )
                 gains[f"{named_scene.object}, {named_scene.environment}"] = (
                     description.gain
                 )
@@ -558,14 +583,14 @@ class Sweep:
             formation = formation.model_copy(update={"gain": None})
         return formation, gains
 
-    def _compare_arms(self, predictions: Predictions) -> BesideClean | None:
+    def _compare_arms(self, predictions: Predictions) -> ArmComparison | None:
         """Compare the scenes without and with an adversarial configuration."""
-        adversarial = self.job.places[-1].beside_clean
+        adversarial = self.job.scenes[-1].arm
         if not adversarial:
             return None
         models = [model.name for model in self.job.models]
-        pairs = predictions.beside(models, self.units)
-        return BesideClean(answer=adversarial, pairs=pairs)
+        pairs = predictions.compare_arms(models, self.units)
+        return ArmComparison(answer=adversarial, pairs=pairs)
 
     def _count_renders(self, verified: WorstVerified | None) -> dict[str, int]:
         """Return how many images were traced, and how many predicted instead."""
@@ -581,9 +606,9 @@ class Sweep:
             summary for summaries in self._transport.values() for summary in summaries
         ]
         if not self._transport and self._scenes.scene is not None:
-            predictors = self._scenes.scene.predicted.values()
-            transport = [predictor.summary() for predictor in predictors]
-        return combined(transport)
+            predictors = self._scenes.scene.predictors.values()
+            transport = [predictor.summarize() for predictor in predictors]
+        return combine_transport(transport)
 
     def _compute_speed(self, sweep_seconds: float) -> float | None:
         """Return rendered images a second; None if none was rendered now."""
@@ -598,12 +623,12 @@ class Sweep:
             metric = f"{claim} {change}"
             value_of_row = {
                 row.step: row.metrics[metric]
-                for row in self.rows()
+                for row in self.iterate_rows()
                 if row.label != OUT_OF_VIEW and metric in row.metrics
             }
             for model, network in enumerate(self.job.models):
                 rows = np.array(
-                    [row for row in value_of_row if row % self.models == model],
+                    [row for row in value_of_row if row % self.n_models == model],
                     dtype=np.int64,
                 )
                 is_claimed = np.array(
@@ -612,7 +637,7 @@ class Sweep:
                 violations = rows[~is_claimed]
                 rates.append(
                     ChangeRates(
-                        **vars(counted_by_unit(is_claimed, self.units.of(rows))),
+                        **vars(count_by_unit(is_claimed, self.units.of(rows))),
                         model=network.name,
                         claim=claim,
                         when=change,
@@ -628,11 +653,11 @@ class Sweep:
         changes: Sequence[ChangeRates],
     ) -> Iterator[str]:
         """Yield what a reader of the result has to know."""
-        yield from lost_remarks(self._n_lost)
+        yield from make_lost_remarks(self._n_lost)
         yield from self.journal.remarks
         if self.units.noise > 1:
             yield repeats_remark(
-                self.units.name, self.units.noise, self.total // self.units.size
+                self.units.name, self.units.noise, self.n_rows // self.units.size
             )
         yield from self._drive_remarks()
         yield from self._prediction_remarks(predictions)
@@ -665,7 +690,7 @@ class Sweep:
         if n_drives == 1 and self.units.noise == 1:
             yield "One drive says nothing of others: there is no interval over drives."
         elif 1 < n_drives < ENOUGH_DRIVES:
-            lower_bound = most_shown(n_drives)
+            lower_bound = max_lower_bound(n_drives)
             yield (
                 f"{count(n_drives, 'drive')} can show little: were the model right in "
                 "all their frames, the interval of "
@@ -674,10 +699,10 @@ class Sweep:
 
     def _prediction_remarks(self, predictions: Predictions) -> Iterator[str]:
         """Yield which predictions do not count, or not as right."""
-        n_hidden = int(predictions.hidden.sum())
+        n_hidden = int(predictions.is_hidden.sum())
         if n_hidden:
-            images = count(int(predictions.seen.sum()), "picture")
-            n_phantoms = predictions.phantoms_out_of_view
+            images = count(int(predictions.is_known.sum()), "picture")
+            n_phantoms = predictions.n_phantoms_out_of_view
             phantoms = ""
             if n_phantoms:
                 phantoms = (
@@ -687,9 +712,9 @@ class Sweep:
                 f"In {n_hidden} of {images} nothing of the object is to be seen: they "
                 f"are not counted.{phantoms}"
             )
-        if predictions.not_finite:
+        if predictions.n_non_finite:
             yield (
-                f"{predictions.not_finite} predictions of the model are not "
+                f"{predictions.n_non_finite} predictions of the model are not "
                 "numbers; "
                 "they count as not right."
             )

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import JsonObject, JsonValue
-from advsearch.questions.sweep.display import of_grid, outcomes_clause, rate_text
+from advsearch.questions.sweep.display import grid_clause, outcomes_clause, rate_text
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
 from advsearch.report.views import Html, element, join_html
@@ -33,16 +33,21 @@ from advsearch.trust.writing import (
     write_bytes,
     write_text,
 )
-from advsearch.viewer.columns import packed, read_columns
+from advsearch.viewer.columns import pack_columns, read_columns
 from advsearch.viewer.document import (
-    data_script,
-    data_url,
-    document,
+    make_data_script,
+    make_data_url,
+    make_document,
     remarks_html,
     subject_html,
 )
-from advsearch.viewer.pages import end_html, page_of, part_html
-from advsearch.viewer.thumbnails import Kept, kept_pictures, path_of, read_thumbnail
+from advsearch.viewer.pages import make_end, make_part, make_run_page
+from advsearch.viewer.thumbnails import (
+    Thumbnails,
+    find_thumbnails,
+    read_thumbnail,
+    thumbnail_path,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -64,20 +69,20 @@ class SweepSource:
         rows: as columns, for a page that needs no other file, or the address they are
             fetched from; None if they are too many for such a page, which then has the
             tables only.
-        parts: whether the rows are fetched in parts (``?after=ID``), as those of a
+        is_partial: whether the rows are fetched in parts (``?after=ID``), as those of a
             sweep that goes on.
-        pictures: the thumbnails.
-        folder: address of the thumbnails; None puts them into the page.
+        thumbnails: the thumbnails.
+        thumbnail_address: address of the thumbnails; None puts them into the page.
     """
 
     name: str
     rows: pd.DataFrame | str | None
-    parts: bool = False
-    pictures: Kept | None = None
-    folder: str | None = None
+    is_partial: bool = False
+    thumbnails: Thumbnails | None = None
+    thumbnail_address: str | None = None
 
     @property
-    def embedded(self) -> bool:
+    def is_embedded(self) -> bool:
         """Whether the page has the rows in itself."""
         return self.rows is not None and not isinstance(self.rows, str)
 
@@ -97,12 +102,14 @@ def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
         StorageError: the page cannot be written.
     """
     columns = read_columns(run)
-    write_bytes(run / directory.COLUMNS, packed(columns), durable=False)
-    html = page(run, summary, columns)
+    write_bytes(run / directory.COLUMNS, pack_columns(columns), durable=False)
+    html = make_page(run, summary, columns)
     return write_text(run / directory.REPORT, html, durable=False)
 
 
-def page(run: Path, summary: SweepSummary, columns: pd.DataFrame | None = None) -> str:
+def make_page(
+    run: Path, summary: SweepSummary, columns: pd.DataFrame | None = None
+) -> str:
     """Return the page of a sweep that needs no other file.
 
     Args:
@@ -112,11 +119,11 @@ def page(run: Path, summary: SweepSummary, columns: pd.DataFrame | None = None) 
     """
     columns = read_columns(run) if columns is None else columns
     rows = columns if len(columns) <= MAX_EMBEDDED_ROWS else None
-    source = SweepSource(run.name, rows, pictures=kept_pictures(run))
-    return sweep_page_html([(run, summary)], [source])
+    source = SweepSource(run.name, rows, thumbnails=find_thumbnails(run))
+    return make_sweep_page([(run, summary)], [source])
 
 
-def sweep_page_html(
+def make_sweep_page(
     runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[SweepSource]
 ) -> str:
     """Return the page of sweeps.
@@ -134,15 +141,15 @@ def sweep_page_html(
     embedded_rows = list[Html]()
     image_notes = list[Html]()
     for index, (source, path, summary) in enumerate(explored):
-        description: JsonObject = {"name": source.name, "parts": source.parts}
-        if source.embedded:
+        description: JsonObject = {"name": source.name, "parts": source.is_partial}
+        if source.is_embedded:
             row_id = f"rows-{index}"
             description["embedded"] = row_id
             embedded_rows.append(_embed_rows(source.rows, row_id))
         else:
             description["rows"] = source.rows
-        if source.pictures is not None:
-            images, note = _describe_images(source, source.pictures)
+        if source.thumbnails is not None:
+            images, note = _describe_images(source, source.thumbnails)
             description["pictures"] = images
             image_notes += [] if note is None else [note]
         descriptions.append(description | _describe_evaluation(path, summary))
@@ -157,13 +164,13 @@ def sweep_page_html(
     if not explored:
         explorer = _too_many_rows_html(runs)
     needs_connection = any(
-        isinstance(source.rows, str) or source.folder for source in sources
+        isinstance(source.rows, str) or source.thumbnail_address for source in sources
     )
-    return document(
+    return make_document(
         ", ".join(path.name for path, _ in runs),
         _header_html(runs),
         element("main", explorer, *image_notes, *stills, *parts),
-        data=[data_script(descriptions, "runs"), *embedded_rows],
+        data=[make_data_script(descriptions, "runs"), *embedded_rows],
         scripts=["sweep.js"],
         connects=needs_connection,
     )
@@ -171,24 +178,26 @@ def sweep_page_html(
 
 def _embed_rows(rows: Any, element_id: str) -> Html:
     """Return a script element that holds rows, compressed."""
-    zipped = gzip.compress(packed(rows), 6, mtime=0)
+    zipped = gzip.compress(pack_columns(rows), 6, mtime=0)
     encoded = Html(base64.b64encode(zipped).decode())
     return element("script", encoded, type="application/octet-stream", id=element_id)
 
 
 def _describe_images(
-    source: SweepSource, thumbnails: Kept
+    source: SweepSource, thumbnails: Thumbnails
 ) -> tuple[JsonObject, Html | None]:
     """Return where the explorer finds thumbnails, and which are left out, if any."""
-    images: JsonObject = {"models": thumbnails.models}
-    if source.folder is not None:
-        images["folder"] = source.folder
+    images: JsonObject = {"models": thumbnails.configurations_per_image}
+    if source.thumbnail_address is not None:
+        images["folder"] = source.thumbnail_address
         images["suffix"] = "jpg"
-        images["kept"] = [*thumbnails.numbers] if thumbnails.some else None
+        images["kept"] = [*thumbnails.numbers] if thumbnails.is_subset else None
         return images, None
-    if not source.embedded:
+    if not source.is_embedded:
         return images, None
-    embedded: JsonObject = dict(thumbnails.embedded(source.rows, MAX_EMBEDDED_BYTES))
+    embedded: JsonObject = dict(
+        thumbnails.list_data_urls(source.rows, MAX_EMBEDDED_BYTES)
+    )
     images["embedded"] = embedded
     n_thumbnails = len(thumbnails.numbers)
     if len(embedded) == n_thumbnails:
@@ -207,8 +216,8 @@ def _page_parts_html(path: Path, summary: SweepSummary) -> list[Html | None]:
         part for part in view.sections if part.only == "page" and not part.empty
     ]
     return [
-        *(part_html(path, part, view.said) for part in page_parts),
-        end_html(path, summary, view),
+        *(make_part(path, part, view.said) for part in page_parts),
+        make_end(path, summary, view),
     ]
 
 
@@ -252,7 +261,7 @@ def _header_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
         )
         lines += [
             element("p", f"sweep {path.name}; ", subject, class_="eyebrow"),
-            element(heading, sweep_verdict(summary)),
+            element(heading, verdict_text(summary)),
             remarks_html(summary.warnings),
         ]
     title = element("h1", "Sweeps side by side") if len(runs) > 1 else None
@@ -280,7 +289,7 @@ def _too_many_rows_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Htm
     )
 
 
-def sweep_verdict(summary: SweepSummary) -> str:
+def verdict_text(summary: SweepSummary) -> str:
     """Return the result of a sweep in a sentence, also of one that goes on."""
     if not summary.configurations:
         if summary.out_of_view:
@@ -293,7 +302,7 @@ def sweep_verdict(summary: SweepSummary) -> str:
     so_far = ""
     if summary.looked_at != summary.planned:
         so_far = f" so far, of {summary.planned} planned"
-    accuracy = f"({rate_text(summary)}){of_grid(summary)}"
+    accuracy = f"({rate_text(summary)}){grid_clause(summary)}"
     return (
         f"Right in {summary.correct} of {summary.configurations} "
         f"configurations{so_far} {accuracy}{outcomes_clause(summary)}."
@@ -345,11 +354,13 @@ def _figure_html(file: Path, caption: str) -> Html | None:
     """Return a PNG file as a figure; None if there is no such file."""
     if not file.is_file():
         return None
-    image = element("img", src=data_url(file.read_bytes(), "image/png"), alt=caption)
+    image = element(
+        "img", src=make_data_url(file.read_bytes(), "image/png"), alt=caption
+    )
     return element("figure", image, element("figcaption", caption))
 
 
-def result_of(run: Path) -> SweepSummary | None:
+def load_sweep_result(run: Path) -> SweepSummary | None:
     """Read the result of a sweep.
 
     None if it has none yet, or is a run of another command.
@@ -395,9 +406,9 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
             run, result = results[0]
             # Pages are made anew: what lies in the run may be anybody's.
             for file in sorted((run / directory.PARTS).glob(f"*/{directory.REPORT}")):
-                html = page_of(file.parent, read_result(file.parent))
+                html = make_run_page(file.parent, read_result(file.parent))
                 write_text(folder / file.relative_to(run), html)
-            return write_text(folder / INDEX, page_of(run, result))
+            return write_text(folder / INDEX, make_run_page(run, result))
         if len(sweeps) < len(results):
             raise InputError(
                 "bundle: one run or several sweeps make a page; give one kind of them"
@@ -405,7 +416,7 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
         sources = [
             _write_source(run, index, folder) for index, (run, _) in enumerate(sweeps)
         ]
-        return write_text(folder / INDEX, sweep_page_html(sweeps, sources))
+        return write_text(folder / INDEX, make_sweep_page(sweeps, sources))
 
 
 def _write_source(run: Path, index: int, folder: Path) -> SweepSource:
@@ -421,11 +432,13 @@ def _write_source(run: Path, index: int, folder: Path) -> SweepSource:
     rows: pd.DataFrame | str = columns
     if len(columns) > MAX_EMBEDDED_ROWS:
         rows = f"rows-{index}.bin"
-        write_bytes(folder / rows, packed(columns))
+        write_bytes(folder / rows, pack_columns(columns))
     image_folder = f"pictures-{index}"
-    stored = kept_pictures(run)
+    stored = find_thumbnails(run)
     for number in stored.numbers if stored else ():
-        file = path_of(folder / image_folder, number)
+        file = thumbnail_path(folder / image_folder, number)
         target = folder / image_folder / file.parent.name / file.name
         write_bytes(target, read_thumbnail(run, number))
-    return SweepSource(run.name, rows, pictures=stored, folder=image_folder)
+    return SweepSource(
+        run.name, rows, thumbnails=stored, thumbnail_address=image_folder
+    )

@@ -19,25 +19,25 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Query
-from advsearch.attacks.domain import Product
+from advsearch.attacks.domain import ProductIndex
 from advsearch.engine.acceptance import (
     CHECK_SPP,
-    VIEWS,
+    N_VIEWS,
     ComparedView,
     Deviation,
-    compared,
-    view_of,
+    compare_views,
+    compare_with_traced,
 )
 from advsearch.engine.problem import Problem
-from advsearch.engine.surface_light import LIGHTS, SurfaceLight
+from advsearch.engine.surface_light import N_LIGHTS, SurfaceLight
 from advsearch.engine.verifier import Verifier
 from advsearch.questions.sweep.axes import Axis, Points
 from advsearch.runs.results import LinearTransport, PredictionError
-from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.color import to_8_bit
-from advsearch.scene.mitsuba_backend.surface import RAYS
+from advsearch.scene.assembly import IMAGE_INPUTS
+from advsearch.scene.color import round_to_8_bit
+from advsearch.scene.mitsuba_backend.surface import RAYS_PER_PIXEL
 from advsearch.scene.predictor import (
-    MOST_BYTES,
+    MAX_BYTES,
     NOISE,
     NOTHING_MOVES,
     Predictor,
@@ -45,10 +45,19 @@ from advsearch.scene.predictor import (
     RefusalCause,
 )
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP
-from advsearch.scene.surface.renderer import SurfaceRenderer, varied, why_not_kept
-from advsearch.scene.transport.lights import BasisRenderer, Lights, lighting
-from advsearch.scene.transport.matrix import SPP
+from advsearch.scene.surface.arrangement import (
+    CAMERA_INPUTS,
+    COLOR_INPUT,
+    ENVIRONMENT_INPUT,
+    FREE_INPUTS,
+)
+from advsearch.scene.surface.renderer import (
+    SurfaceRenderer,
+    find_changed_inputs,
+    find_scene_refusal,
+)
+from advsearch.scene.transport.lights import BasisRenderer, LightBasis, find_lighting
+from advsearch.scene.transport.matrix import COLLECTED_SPP
 from advsearch.trust.stored_files import scaled
 
 MIN_SAVING_FACTOR = 2.0
@@ -68,14 +77,14 @@ class Groups:
         frames: the axis with the frames of a drive, which have one draw.
 
     Attributes:
-        size: images of a group.
-        count: groups.
-        at_once: groups that have to be cached, so that no predictor is made twice.
+        group_size: images of a group.
+        n_groups: groups.
+        n_cached_groups: groups that have to be cached, so that no predictor is made twice.
     """
 
     def __init__(
         self,
-        grid: Product,
+        grid: ProductIndex,
         samples: int,
         within: tuple[bool, ...],
         drawn: bool,
@@ -84,7 +93,7 @@ class Groups:
         self.grid = grid
         self.samples = samples
         # Samples are like one more axis, the fastest.
-        self._all_axes = Product((*grid.sizes, samples))
+        self._all_axes = ProductIndex((*grid.sizes, samples))
         axis_is_within = [
             may_differ and (drawn or axis == frames)
             for axis, may_differ in enumerate(within)
@@ -92,17 +101,17 @@ class Groups:
         self._is_within = (*axis_is_within, drawn)
         within_sizes = self._select(self._all_axes.sizes, True)
         between_sizes = self._select(self._all_axes.sizes, False)
-        self._within = Product(tuple(within_sizes))
-        self._between = Product(tuple(between_sizes))
-        self.size = self._within.count
-        self.count = self._between.count
-        self.at_once = 1
+        self._within = ProductIndex(tuple(within_sizes))
+        self._between = ProductIndex(tuple(between_sizes))
+        self.group_size = self._within.count
+        self.n_groups = self._between.count
+        self.n_cached_groups = 1
         if True in self._is_within:
             # Groups differ along slower axes one after the other.
             first_within = self._is_within.index(True)
             for axis in range(first_within, len(self._is_within)):
                 if not self._is_within[axis]:
-                    self.at_once *= self._all_axes.sizes[axis]
+                    self.n_cached_groups *= self._all_axes.sizes[axis]
 
     def _select(self, values: Sequence[int], is_within: bool) -> list[int]:
         """Return the values of the axes within groups, or of those between."""
@@ -112,12 +121,12 @@ class Groups:
             if within == is_within
         ]
 
-    def group(self, number: int) -> int:
+    def find_group(self, number: int) -> int:
         """Return the index of the group of an image of the scene."""
         digits = self._all_axes.digits(number)
         return self._between.index(self._select(digits, False))
 
-    def member(self, number: int, index: int) -> int:
+    def find_member(self, number: int, index: int) -> int:
         """Return the number of another image of the group of an image.
 
         Args:
@@ -149,14 +158,14 @@ class BasisPictures:
     """
 
     name = "basis pictures"
-    samples = SPP
+    samples = COLLECTED_SPP
     """Samples per pixel of what predicts."""
     bytes = 0
     """Memory of what groups share."""
 
     def __init__(self, renderer: Renderer, seed: int) -> None:
         self._renderer = renderer
-        self._moving = lighting(renderer)
+        self._moving = find_lighting(renderer)
         self.follows = frozenset(self._moving.groups)
         self.moves = any(self._moving.groups.values())
 
@@ -172,19 +181,19 @@ class BasisPictures:
         if renderer.formation.denoiser != "oidn":
             return NOISE
         inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-        n_lights = len(Lights(renderer, self._moving, inputs).alone)
-        prediction_samples = n_lights * SPP + VIEWS * (2 * CHECK_SPP + spp)
+        n_lights = len(LightBasis(renderer, self._moving, inputs).inputs_of_light)
+        prediction_samples = n_lights * COLLECTED_SPP + N_VIEWS * (2 * CHECK_SPP + spp)
         min_images = math.ceil(MIN_SAVING_FACTOR * prediction_samples / spp)
-        if groups.size < min_images:
+        if groups.group_size < min_images:
             return Refusal(
                 f"basis pictures pay where {min_images} pictures or more differ in "
-                f"light alone; here {groups.size} do"
+                f"light alone; here {groups.group_size} do"
             )
         height, width = renderer.formation.resolution
-        n_bytes = groups.at_once * n_lights * 8 * height * width
-        if n_bytes > scaled(MOST_BYTES):
+        n_bytes = groups.n_cached_groups * n_lights * 8 * height * width
+        if n_bytes > scaled(MAX_BYTES):
             return Refusal(
-                f"basis pictures of {groups.count} groups take too much memory; make "
+                f"basis pictures of {groups.n_groups} groups take too much memory; make "
                 "light the last axes of the grid"
             )
         return None
@@ -196,7 +205,7 @@ class BasisPictures:
             u: (d,) configuration of one of them.
             seed: of its light paths.
         """
-        return BasisRenderer(self._renderer, u, seed, moving=self._moving)
+        return BasisRenderer(self._renderer, u, seed, changing=self._moving)
 
 
 ARRANGEMENT_SAMPLES = 2_200_000
@@ -222,7 +231,7 @@ def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> 
     light_samples = (ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES) / (
         height * width
     )
-    check_samples = VIEWS * (2 * CHECK_SPP + spp)
+    check_samples = N_VIEWS * (2 * CHECK_SPP + spp)
     samples = light_samples + check_samples
     return math.ceil(MIN_SAVING_FACTOR * samples / (spp - PREDICTION_SPP))
 
@@ -240,7 +249,7 @@ class LightOnSurfaces:
     """
 
     name = "surface light"
-    samples = RAYS
+    samples = RAYS_PER_PIXEL
 
     def __init__(self, renderer: Renderer, seed: int) -> None:
         self._renderer = renderer
@@ -248,18 +257,20 @@ class LightOnSurfaces:
         self._arrangements: list[SurfaceRenderer] = []
         self._max_arrangements = 0
         self._changed_inputs = {
-            group.name: varied(renderer, [group.name])
+            group.name: find_changed_inputs(renderer, [group.name])
             for group in renderer.space.groups
         }
-        self.follows = self._find_groups_changing_only(CAMERAS)
-        self.moves = any(self._changed_inputs[name] & CAMERAS for name in self.follows)
+        self.follows = self._find_groups_changing_only(CAMERA_INPUTS)
+        self.moves = any(
+            self._changed_inputs[name] & CAMERA_INPUTS for name in self.follows
+        )
 
     def _find_groups_changing_only(self, inputs: frozenset[str]) -> frozenset[str]:
         """Return the groups of coordinates that change nothing but these inputs.
 
         They may change the finished image, too.
         """
-        allowed = inputs | ON_PICTURE
+        allowed = inputs | IMAGE_INPUTS
         return frozenset(
             name for name, changed in self._changed_inputs.items() if changed <= allowed
         )
@@ -272,22 +283,30 @@ class LightOnSurfaces:
             spp: samples per pixel of the images.
         """
         groups = fall(self.follows)
-        arranged = fall(self._find_groups_changing_only(FREE - {COLOR}))
-        self._max_arrangements = arranged.at_once
-        min_images = find_break_even(self._renderer, spp, arranged.count / groups.count)
-        if groups.size < min_images:
+        arranged = fall(self._find_groups_changing_only(FREE_INPUTS - {COLOR_INPUT}))
+        self._max_arrangements = arranged.n_cached_groups
+        min_images = find_break_even(
+            self._renderer, spp, arranged.n_groups / groups.n_groups
+        )
+        if groups.group_size < min_images:
             return Refusal(
                 f"light on surfaces pays where {min_images} pictures differ in the "
-                f"camera alone; here {groups.size} do"
+                f"camera alone; here {groups.group_size} do"
             )
-        refusal = why_not_kept(self._renderer)
+        refusal = find_scene_refusal(self._renderer)
         if refusal is not None:
             return refusal
-        light_bytes = LIGHT_BYTES + 4 * self._renderer.scene.base(MAP).numel()
-        n_bytes = arranged.at_once * ARRANGEMENT_BYTES + groups.at_once * light_bytes
-        if n_bytes > scaled(MOST_BYTES):
+        light_bytes = (
+            LIGHT_BYTES
+            + 4 * self._renderer.scene.get_base_value(ENVIRONMENT_INPUT).numel()
+        )
+        n_bytes = (
+            arranged.n_cached_groups * ARRANGEMENT_BYTES
+            + groups.n_cached_groups * light_bytes
+        )
+        if n_bytes > scaled(MAX_BYTES):
             return Refusal(
-                f"light of {groups.count} groups takes too much memory; make the "
+                f"light of {groups.n_groups} groups takes too much memory; make the "
                 "camera the last axes of the grid"
             )
         return None
@@ -302,38 +321,38 @@ class LightOnSurfaces:
         with torch.no_grad():
             inputs = self._renderer.scene.assembly(self._renderer.space.inputs(u))
             for arrangement in self._arrangements:
-                if arrangement.stands(inputs):
-                    return arrangement.under(inputs)
+                if arrangement.is_applicable(inputs):
+                    return arrangement.with_fixed_light(inputs)
             if len(self._arrangements) >= self._max_arrangements:
                 self._arrangements.pop(0)
             arrangement = SurfaceRenderer(self._renderer, u, self._seed)
             self._arrangements.append(arrangement)
-            return arrangement.under(inputs)
+            return arrangement.with_fixed_light(inputs)
 
     @property
     def bytes(self) -> int:
         """Memory of the arrangements."""
-        return sum(arrangement.bytes for arrangement in self._arrangements)
+        return sum(arrangement.n_bytes for arrangement in self._arrangements)
 
 
 @dataclass(frozen=True, eq=False)
-class SweptPicture:
+class SweptImage:
     """An image of a sweep.
 
     Attributes:
-        picture: (H, W, 3), sRGB in [0, 1].
-        predicted: samples per pixel of what predicted it; 0 if it was rendered.
-        traced: images that were traced for it; those for a group count for the first
+        image: (H, W, 3), sRGB in [0, 1].
+        prediction_spp: samples per pixel of what predicted it; 0 if it was rendered.
+        n_traced: images that were traced for it; those for a group count for the first
             image of the group.
     """
 
-    picture: Tensor
-    predicted: int
-    traced: int
+    image: Tensor
+    prediction_spp: int
+    n_traced: int
 
 
 @dataclass
-class PredictedSweep:
+class SweepPredictor:
     """Makes the images of one scene at one size, by prediction where that pays.
 
     Attributes:
@@ -342,10 +361,10 @@ class PredictedSweep:
         axes: of the grid.
         seed: of the predictors.
         specialise: whether anything is predicted.
-        before: images of the scenes before this one.
+        images_before: images of the scenes before this one.
         deviations: of the predictors that were compared with traced images.
         seconds: that making and comparing them took.
-        left: groups whose images are rendered because predictions deviated too much.
+        rendered_groups: groups whose images are rendered because predictions deviated too much.
         method: how images are predicted, or would be.
         refusal: why all images are rendered; None if they are predicted.
     """
@@ -355,10 +374,10 @@ class PredictedSweep:
     axes: tuple[Axis, ...]
     seed: int
     specialise: bool
-    before: int = 0
+    images_before: int = 0
     deviations: list[Deviation] = field(default_factory=list)
     seconds: float = 0.0
-    left: set[int] = field(default_factory=set)
+    rendered_groups: set[int] = field(default_factory=set)
     # images that were traced for each group
     _traced: dict[int, int] = field(default_factory=dict)
     # None where the images of a group are rendered
@@ -391,8 +410,8 @@ class PredictedSweep:
         """Return why a method does not predict these images; None if it does."""
         if not method.moves:
             return NOTHING_MOVES
-        if self.renderer.composed or not self.specialise:
-            return Refusal(self.renderer.composed or "nothing is left out")
+        if self.renderer.composition_reason or not self.specialise:
+            return Refusal(self.renderer.composition_reason or "nothing is left out")
         return method.find_refusal(self._make_groups, self.problem.spp)
 
     def _make_groups(self, follows: frozenset[str]) -> Groups:
@@ -411,7 +430,7 @@ class PredictedSweep:
             self.points.units.frames,
         )
 
-    def pictures(self, query_of_image: Mapping[int, Query]) -> dict[int, SweptPicture]:
+    def make_images(self, query_of_image: Mapping[int, Query]) -> dict[int, SweptImage]:
         """Render or predict images.
 
         Args:
@@ -420,26 +439,26 @@ class PredictedSweep:
         Returns:
             The images by their numbers.
         """
-        images: dict[int, SweptPicture] = {}
+        images: dict[int, SweptImage] = {}
         numbers_by_predictor: dict[Predictor, list[int]] = {}
         for number, query in query_of_image.items():
             predictor = None
             if self.refusal is None:
-                group = self._groups.group(number)
+                group = self._groups.find_group(number)
                 predictor = self._load_predictor(group, number)
             if predictor is None:
                 image = self.renderer(query.u, seed=query.seed, spp=self.problem.spp)
                 n_traced = self._count_traced(number) + 1
-                images[number] = SweptPicture(image, predicted=0, traced=n_traced)
+                images[number] = SweptImage(image, prediction_spp=0, n_traced=n_traced)
             else:
                 numbers_by_predictor.setdefault(predictor, []).append(number)
         for predictor, numbers in numbers_by_predictor.items():
-            predicted = predictor.pictures(
+            predicted = predictor.predict_images(
                 [query_of_image[number].u for number in numbers]
             )
             for number, image in zip(numbers, predicted, strict=True):
                 n_traced = self._count_traced(number)
-                images[number] = SweptPicture(image, self.method.samples, n_traced)
+                images[number] = SweptImage(image, self.method.samples, n_traced)
         return images
 
     def _count_traced(self, number: int) -> int:
@@ -447,9 +466,9 @@ class PredictedSweep:
 
         Of the other images of the group it is 0.
         """
-        if number != self._groups.member(number, 0):
+        if number != self._groups.find_member(number, 0):
             return 0
-        return self._traced.get(self._groups.group(number), 0)
+        return self._traced.get(self._groups.find_group(number), 0)
 
     def _load_predictor(self, group: int, number: int) -> Predictor | None:
         """Return the predictor of a group; None if its images are rendered.
@@ -463,17 +482,17 @@ class PredictedSweep:
         """
         if group in self._predictors:
             return self._predictors[group]
-        if len(self._predictors) >= self._groups.at_once:
+        if len(self._predictors) >= self._groups.n_cached_groups:
             self._predictors.pop(next(iter(self._predictors)))
         begin = time.perf_counter()
-        seed = seeds.stream(self.seed, "light", self.before + group)
+        seed = seeds.stream(self.seed, "light", self.images_before + group)
         predictor = self.method.make_predictor(self._configuration(number, 0), seed)
         deviation = self._compare(predictor, number, seed)
         self.deviations.append(deviation)
-        self._traced[group] = predictor.lights + deviation.pictures
-        if not deviation.good:
-            self.left.add(group)
-        self._predictors[group] = predictor if deviation.good else None
+        self._traced[group] = predictor.n_traced_images + deviation.n_traced
+        if not deviation.is_accepted:
+            self.rendered_groups.add(group)
+        self._predictors[group] = predictor if deviation.is_accepted else None
         self.seconds += time.perf_counter() - begin
         return self._predictors[group]
 
@@ -487,27 +506,27 @@ class PredictedSweep:
         """
 
         def margin(image: Tensor, u: Tensor) -> float:
-            return self.problem.judge(to_8_bit(image), u).margin
+            return self.problem.judge(round_to_8_bit(image), u).margin
 
         def view(check: int) -> ComparedView:
-            index = seeds.stream(seed, "check", check) % self._groups.size
+            index = seeds.stream(seed, "check", check) % self._groups.group_size
             u = self._configuration(number, index)
-            (predicted,) = predictor.pictures([u])
+            (predicted,) = predictor.predict_images([u])
             noise_seed = seeds.stream(seed, "traced", check)
-            return view_of(
+            return compare_with_traced(
                 self.renderer, predicted, u, noise_seed, self.problem.spp, margin
             )
 
         with torch.no_grad():
-            return compared(view)
+            return compare_views(view)
 
     def _configuration(self, number: int, index: int) -> Tensor:
         """Return a configuration (d,) of the group of an image, by its index there."""
-        member = self._groups.member(number, index)
-        return self.points.configurations(member, 1, self.before)[0]
+        member = self._groups.find_member(number, index)
+        return self.points.make_configurations(member, 1, self.images_before)[0]
 
     @property
-    def not_finite(self) -> int:
+    def n_non_finite(self) -> int:
         """How many values were not finite, and were set to 0."""
         return sum(
             predictor.non_finite
@@ -515,7 +534,7 @@ class PredictedSweep:
             if predictor is not None
         )
 
-    def summary(self) -> LinearTransport | None:
+    def summarize(self) -> LinearTransport | None:
         """Return what a result holds of the predictions.
 
         None if nothing moves that any method follows.
@@ -529,13 +548,13 @@ class PredictedSweep:
             worst = max(self.deviations, key=lambda deviation: deviation.levels)
             error = PredictionError.of(worst)
         reason = None
-        if self.left:
+        if self.rendered_groups:
             reason = (
-                f"{len(self.left)} of {self._groups.count} groups were rendered: "
+                f"{len(self.rendered_groups)} of {self._groups.n_groups} groups were rendered: "
                 "predicted pictures were too far off"
             )
         predictor_bytes = sum(
-            predictor.bytes
+            predictor.n_bytes
             for predictor in self._predictors.values()
             if predictor is not None
         )
@@ -551,7 +570,9 @@ class PredictedSweep:
         )
 
 
-def combined(all_summaries: Sequence[LinearTransport | None]) -> LinearTransport | None:
+def combine_transport(
+    all_summaries: Sequence[LinearTransport | None],
+) -> LinearTransport | None:
     """Combine what predicted the images of several scenes.
 
     Returns:
@@ -594,24 +615,24 @@ def prepare_surface_light(
         for group in problem.space.groups
         if not varying.isdisjoint(range(group.begin, group.begin + group.size))
     ]
-    changed_inputs = varied(problem.renderer, groups)
-    if not changed_inputs & CAMERAS or not changed_inputs <= FREE:
+    changed_inputs = find_changed_inputs(problem.renderer, groups)
+    if not changed_inputs & CAMERA_INPUTS or not changed_inputs <= FREE_INPUTS:
         return
-    findings = verifier.findings
-    findings.rendered_because = why_not_kept(problem.renderer)
+    findings = verifier.state
+    findings.predictor_refusal = find_scene_refusal(problem.renderer)
     min_images = find_break_even(problem.renderer, findings.spp)
-    if findings.rendered_because is None and n_images < min_images:
+    if findings.predictor_refusal is None and n_images < min_images:
         reason = f"light on surfaces pays from {min_images} pictures on"
-        findings.rendered_because = Refusal(reason, RefusalCause.TOO_FEW_STEPS)
-    if findings.rendered_because is not None:
+        findings.predictor_refusal = Refusal(reason, RefusalCause.TOO_FEW_STEPS)
+    if findings.predictor_refusal is not None:
         return
     title = "finding the light on surfaces"
     verifier.stages.begin(
-        "transport", title, LIGHTS, hint="`specialise=false` leaves it out"
+        "transport", title, N_LIGHTS, hint="`specialise=false` leaves it out"
     )
-    light = SurfaceLight(problem, 0, at=at, places=coordinates)
+    light = SurfaceLight(problem, 0, light_u=at, moving_coordinates=coordinates)
     light.prepare(verifier.stages.progress.advance)
-    findings.transport = light
-    findings.rendered_because = light.too_far_off
-    if findings.rendered_because is not None:
-        findings.transport = None
+    findings.predictor = light
+    findings.predictor_refusal = light.accuracy_refusal
+    if findings.predictor_refusal is not None:
+        findings.predictor = None

@@ -21,7 +21,7 @@ import pandas as pd
 from advsearch.errors import FileFormatError
 from advsearch.options import OUT_OF_VIEW, Outcome, get_outcome
 from advsearch.pictures import LARGEST_FILE, check_pixels, opened
-from advsearch.questions.sweep.display import sweep_axes, sweep_figure
+from advsearch.questions.sweep.display import draw_sweep, draw_sweep_on
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.summary import (
@@ -39,10 +39,10 @@ from advsearch.runs.export import read_threedb
 from advsearch.runs.results import CountedPredictions
 from advsearch.runs.tables import Units, read_sweep, to_pandas
 from advsearch.statistics.clustered import (
-    mean_share,
-    paired_by_unit,
-    per_unit,
-    share_interval,
+    compare_paired,
+    mean_rate,
+    rate_interval,
+    sum_per_unit,
 )
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement
@@ -58,7 +58,7 @@ OUTCOMES = tuple(Outcome)
 UNKNOWN_OUTCOME = 255  # in arrays of indices among `OUTCOMES`
 
 
-def counted_by_unit(
+def count_by_unit(
     right: npt.ArrayLike,
     units: npt.NDArray[np.int64],
     outcome: npt.NDArray[np.uint8] | None = None,
@@ -75,16 +75,16 @@ def counted_by_unit(
     """
     right = np.asarray(right)
     if not len(right):
-        return rate(0, 0)
-    right_in_unit = per_unit(right, units)
-    unit_size = per_unit(np.ones(len(right)), units)
+        return count_independent(0, 0)
+    right_in_unit = sum_per_unit(right, units)
+    unit_size = sum_per_unit(np.ones(len(right)), units)
     interval = None
     if len(unit_size) > 1 or len(right) == 1:
-        interval = share_interval(right_in_unit, unit_size)
+        interval = rate_interval(right_in_unit, unit_size)
     return CountedPredictions(
         configurations=len(right),
         correct=int(right.sum()),
-        accuracy=mean_share(right_in_unit, unit_size),
+        accuracy=mean_rate(right_in_unit, unit_size),
         interval=interval,
         outcomes=None if outcome is None else _count_outcomes(outcome[right == 0]),
     )
@@ -101,7 +101,7 @@ def _count_outcomes(outcome: npt.NDArray[np.uint8]) -> dict[str, int] | None:
     return count_by_name or None
 
 
-def rate(
+def count_independent(
     correct: int, n_predictions: int, interval: tuple[float, float] | None = None
 ) -> CountedPredictions:
     """Return the accuracy of independent predictions with its 95 % interval.
@@ -129,17 +129,17 @@ class Predictions:
     """The predictions so far, by the number of the row.
 
     Attributes:
-        seen: (n,) whether there is a prediction.
-        right: (n,) whether it is right.
-        hidden: (n,) whether nothing of what is judged is in the image.
+        is_known: (n,) whether there is a prediction.
+        is_right: (n,) whether it is right.
+        is_hidden: (n,) whether nothing of what is judged is in the image.
         margin: (n,) NaN where it is not a number.
         outcome: (n,) of a detector, indices among `OUTCOMES`.
     """
 
     def __init__(self, n_rows: int) -> None:
-        self.seen: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
-        self.right: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
-        self.hidden: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self.is_known: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self.is_right: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self.is_hidden: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self._wrong: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.margin = np.full(n_rows, np.nan)
         self.outcome = np.full(n_rows, UNKNOWN_OUTCOME, np.uint8)
@@ -149,11 +149,11 @@ class Predictions:
     def add(self, row: int, judgement: Judgement) -> None:
         """Add the judgement of a row; one that was there before is replaced."""
         label = judgement.prediction.label
-        self.seen[row] = True
-        self.right[row] = judgement.right
+        self.is_known[row] = True
+        self.is_right[row] = judgement.right
         self._wrong[row] = judgement.success
         self.margin[row] = judgement.margin
-        self.hidden[row] = label == OUT_OF_VIEW
+        self.is_hidden[row] = label == OUT_OF_VIEW
         outcome = get_outcome(judgement.payload)
         if outcome is not None:
             self.outcome[row] = OUTCOMES.index(outcome)
@@ -161,34 +161,34 @@ class Predictions:
         self._label_index[row] = self._index_by_label.setdefault(label, n_labels)
 
     @property
-    def counted(self) -> npt.NDArray[np.bool_]:
+    def is_counted(self) -> npt.NDArray[np.bool_]:
         """(n,) whether there is a prediction, and the object is in the image."""
-        return np.asarray(self.seen & ~self.hidden)
+        return np.asarray(self.is_known & ~self.is_hidden)
 
     @property
-    def phantoms_out_of_view(self) -> int:
+    def n_phantoms_out_of_view(self) -> int:
         """Images without the object in which a detector finds it all the same."""
         is_phantom = self.outcome == OUTCOMES.index(Outcome.PHANTOM)
-        return int((self.hidden & is_phantom).sum())
+        return int((self.is_hidden & is_phantom).sum())
 
     @property
-    def worst(self) -> int | None:
+    def worst_row(self) -> int | None:
         """The first row of the smallest margin; None if none is a number.
 
         Rows without the object count only if there are no others.
         """
         margin = self.margin
-        if not self.hidden[self.seen].all():
-            margin = np.where(self.hidden, np.nan, margin)
+        if not self.is_hidden[self.is_known].all():
+            margin = np.where(self.is_hidden, np.nan, margin)
         return None if np.isnan(margin).all() else int(np.nanargmin(margin))
 
     @property
-    def not_finite(self) -> int:
+    def n_non_finite(self) -> int:
         """How many margins are not numbers; these predictions count as not right."""
-        return int((self.seen & np.isnan(self.margin)).sum())
+        return int((self.is_known & np.isnan(self.margin)).sum())
 
     @property
-    def frequent(self) -> dict[str, int]:
+    def frequent_wrong_labels(self) -> dict[str, int]:
         """How often each of the most frequent wrong predictions occurs, in order."""
         labels = list(self._index_by_label)
         wrong_labels = Counter(
@@ -197,7 +197,7 @@ class Predictions:
         most_frequent = wrong_labels.most_common(MAX_LISTED_PREDICTIONS)
         return dict(sorted(most_frequent, key=lambda item: (-item[1], item[0])))
 
-    def beside(self, models: Sequence[str], units: Units) -> list[PairedRates]:
+    def compare_arms(self, models: Sequence[str], units: Units) -> list[PairedRates]:
         """Compare the predictions without and with an adversarial configuration.
 
         The second half of the rows are those of the first with the adversarial
@@ -208,9 +208,9 @@ class Predictions:
             units: how rows follow from draws.
         """
         by_arm = (2, -1, len(models))
-        right = self.right.reshape(by_arm)
+        right = self.is_right.reshape(by_arm)
         outcome = self.outcome.reshape(by_arm)
-        both_counted = np.asarray(self.counted.reshape(by_arm).all(axis=0))
+        both_counted = np.asarray(self.is_counted.reshape(by_arm).all(axis=0))
         pairs = list[PairedRates]()
         for model, name in enumerate(models):
             images = np.flatnonzero(both_counted[:, model])
@@ -243,11 +243,11 @@ def _compare_pairs(
     """
     clean, adversarial = right
     clean_outcome, adversarial_outcome = outcome
-    difference, interval, _ = paired_by_unit(clean, adversarial, draws)
+    difference, interval, _ = compare_paired(clean, adversarial, draws)
     return PairedRates(
         model=model,
-        clean=counted_by_unit(clean, draws, clean_outcome),
-        answer=counted_by_unit(adversarial, draws, adversarial_outcome),
+        clean=count_by_unit(clean, draws, clean_outcome),
+        answer=count_by_unit(adversarial, draws, adversarial_outcome),
         both=int((clean & adversarial).sum()),
         clean_only=int((clean & ~adversarial).sum()),
         answer_only=int((~clean & adversarial).sum()),
@@ -258,14 +258,14 @@ def _compare_pairs(
 
 
 @dataclass(frozen=True, eq=False)
-class SweptAxis:
+class TableAxis:
     """Something that a table is by.
 
     Attributes:
         name: of the axis.
         unit: of its values.
         values: or the bounds of parts of a range.
-        places: (n,) the index of each row among these.
+        value_index: (n,) the index of each row among these.
         kind: outside of the scene (object, environment, model), of the grid, or a
             sampled number.
     """
@@ -273,10 +273,10 @@ class SweptAxis:
     name: str
     unit: str
     values: Sequence[Any]
-    places: npt.NDArray[np.integer[Any]]
+    value_index: npt.NDArray[np.integer[Any]]
     kind: Literal["outside", "grid", "drawn"] = "outside"
 
-    def rows(
+    def make_rows(
         self,
         right: npt.NDArray[np.bool_],
         units: npt.NDArray[np.int64],
@@ -293,8 +293,8 @@ class SweptAxis:
             outcome = np.full(len(right), UNKNOWN_OUTCOME, np.uint8)
         predictions = pd.DataFrame({"right": right, "unit": units, "outcome": outcome})
         axis_rows = list[AxisRow]()
-        for index, group in predictions.groupby(self.places):
-            counts = counted_by_unit(group.right, group.unit, group.outcome.to_numpy())
+        for index, group in predictions.groupby(self.value_index):
+            counts = count_by_unit(group.right, group.unit, group.outcome.to_numpy())
             value = self.values[index]
             axis_rows.append(
                 AxisRow(axis=self.name, unit=self.unit, value=value, **vars(counts))
@@ -302,8 +302,8 @@ class SweptAxis:
         return axis_rows
 
 
-def map_over(
-    axes: Sequence[SweptAxis],
+def make_map(
+    axes: Sequence[TableAxis],
     right: npt.NDArray[np.bool_],
     margin: npt.NDArray[np.float64],
 ) -> SweepMap | None:
@@ -327,7 +327,7 @@ def map_over(
     height = len(y_axis.values)
     if width * height > MAX_CELLS:
         return None
-    cell = y_axis.places * width + x_axis.places
+    cell = y_axis.value_index * width + x_axis.value_index
 
     def sum_over_cells(
         cells: npt.NDArray[np.integer[Any]],
@@ -353,7 +353,7 @@ def map_over(
     )
 
 
-def _order_for_map(axes: Sequence[SweptAxis]) -> list[SweptAxis]:
+def _order_for_map(axes: Sequence[TableAxis]) -> list[TableAxis]:
     """Return the axes in the order in which a map takes them."""
     grid = [axis for axis in axes if axis.kind == "grid"]
     outside = [axis for axis in axes if axis.kind == "outside"]
@@ -361,7 +361,7 @@ def _order_for_map(axes: Sequence[SweptAxis]) -> list[SweptAxis]:
     return [*grid, *reversed(outside)] or sampled
 
 
-def _describe_map_axis(axis: SweptAxis) -> MapAxis:
+def _describe_map_axis(axis: TableAxis) -> MapAxis:
     return MapAxis(axis=axis.name, unit=axis.unit, values=list(axis.values))
 
 
@@ -413,7 +413,7 @@ class SweepResult:
             axes: to draw on; None makes new ones.
         """
         axes = new_axes() if axes is None else axes
-        sweep_axes(self.summary, axes)
+        draw_sweep_on(self.summary, axes)
         return axes
 
     def __repr__(self) -> str:
@@ -427,7 +427,7 @@ class SweepResult:
         return result_html(shown(self.summary))
 
     def _repr_png_(self) -> bytes | None:
-        return sweep_figure(self.summary).get("png")
+        return draw_sweep(self.summary).get("png")
 
 
 MAX_PIXELS = 1 << 22  # of an image that is imported
@@ -454,8 +454,8 @@ def import_threedb(
         while batch := list(islice(lines, STORED_BATCH)):
             for row, image_file in batch:
                 if image_file is not None:
-                    thumbnail = thumbnails.thumbnail(read_picture(image_file))
-                    thumbnails.keep(directory.path, row.step, thumbnail)
+                    thumbnail = thumbnails.make_thumbnail(read_image(image_file))
+                    thumbnails.write_thumbnail(directory.path, row.step, thumbnail)
             directory.record(*(row for row, _ in batch))
         rows = read_sweep(directory.path)
         if rows.empty:
@@ -482,8 +482,8 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
     for name in rows.attrs["units"]:
         values, indices = np.unique(rows[name].astype(object), return_inverse=True)
         if 1 < len(values) <= MAX_LISTED_VALUES:
-            axis = SweptAxis(name, "", values.tolist(), indices)
-            tables += axis.rows(right, rows["unit"])
+            axis = TableAxis(name, "", values.tolist(), indices)
+            tables += axis.make_rows(right, rows["unit"])
     names = {
         column: _join_names(rows, column)
         for column in ("object", "environment", "model")
@@ -495,7 +495,7 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
     return SweepSummary(
         run=str(run),
         **names,
-        **vars(rate(int(right.sum()), len(rows))),
+        **vars(count_independent(int(right.sum()), len(rows))),
         **unknown,
         **dict.fromkeys(("not_finite", "spp", "seed"), 0),
         task="classification",
@@ -520,7 +520,7 @@ def _join_names(rows: pd.DataFrame, column: str) -> str:
     return ",".join(map(str, names[:20])) + more or "unknown"
 
 
-def read_picture(path: Path) -> object:
+def read_image(path: Path) -> object:
     """Read an image file as float32 (H, W, 3), sRGB in [0, 1]."""
     with opened(path, LARGEST_FILE) as image:
         check_pixels(path, *image.size, MAX_PIXELS)

@@ -10,15 +10,15 @@ from pydantic import field_validator
 
 from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig
 from advsearch.files import MESHES, either
-from advsearch.options import BY_KEY
-from advsearch.questions.attack.settings import FEWEST_TRIALS, AttackConfig
+from advsearch.options import MITSUBA_CONTROL
+from advsearch.questions.attack.settings import MIN_TRIALS, AttackConfig
 from advsearch.settings import (
     Clash,
-    each_once,
-    number_or_text,
+    parse_number_or_text,
     setting,
     setting_as_in,
     split_names,
+    unique_names_validator,
 )
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class SweepConfig(SceneConfig):
         "cluster",
         "log",
     )
-    several: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
+    list_settings: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
     clashes: ClassVar[tuple[Clash, ...]] = (
         *SceneConfig.clashes,
         Clash(
@@ -216,7 +216,7 @@ class SweepConfig(SceneConfig):
         20,
         "verification",
         "fresh renders that verify the worst configuration; 0 for none",
-        f"0, or a whole number from {FEWEST_TRIALS} to 100000",
+        f"0, or a whole number from {MIN_TRIALS} to 100000",
         unit="renders",
         ge=0,
         le=100_000,
@@ -239,7 +239,7 @@ class SweepConfig(SceneConfig):
     )
     cluster: str | None = setting_as_in(AttackConfig, "cluster")
 
-    _changes = each_once("must_change", "must_not_change")
+    _changes = unique_names_validator("must_change", "must_not_change")
 
     @property
     def claims(self) -> tuple[tuple[str, str], ...]:
@@ -263,12 +263,12 @@ class SweepConfig(SceneConfig):
         return value
 
     @property
-    def title(self) -> tuple[str, ...]:
+    def title_words(self) -> tuple[str, ...]:
         return "-".join(Path(name).stem for name in self.objects), self.command
 
     @property
     def environments(self) -> tuple[str, ...]:
-        return split_names(self.lit_by)
+        return split_names(self.environment_name)
 
     def find_control_type(self, instance: str) -> type[Control] | None:
         """Return the class of a control by the name of its instance.
@@ -288,13 +288,15 @@ class SweepConfig(SceneConfig):
         None if the scene declares them.
         """
         control_type = self.find_control_type(instance)
-        if control_type is None or control_type.kind == BY_KEY:
+        if control_type is None or control_type.kind == MITSUBA_CONTROL:
             return None
-        declared = control_type.declared(self.controls.get(instance, {}))
+        declared = control_type.declare_parameters(self.controls.get(instance, {}))
         return {parameter.name: parameter for parameter in declared}
 
     @classmethod
-    def of_attack(cls, file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
+    def load_attack_defaults(
+        cls, file: Path, typed: Mapping[str, Any]
+    ) -> dict[str, Any]:
         """Return the settings that a sweep takes from the attack it is about.
 
         Args:
@@ -313,7 +315,7 @@ class SweepConfig(SceneConfig):
         )
         settings = {
             name: value
-            for name, value in cls.shared(attack_config).items()
+            for name, value in cls.get_shared_settings(attack_config).items()
             if name not in excluded
         }
         if not typed.get("grid") and not typed.get("controls"):
@@ -328,7 +330,7 @@ class SweepConfig(SceneConfig):
     @field_validator("trials")
     @classmethod
     def _none_or_enough(cls, value: int) -> int:
-        if 0 < value < FEWEST_TRIALS:
+        if 0 < value < MIN_TRIALS:
             raise ValueError("too few to verify anything")
         return value
 
@@ -363,4 +365,4 @@ def _parse_axis(axis: Any) -> str | list[Any]:
     )
     if not values or are_invalid:
         raise ValueError("not values")
-    return [number_or_text(value) for value in values]
+    return [parse_number_or_text(value) for value in values]

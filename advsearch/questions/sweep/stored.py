@@ -9,8 +9,8 @@ from pathlib import Path
 import pandas as pd
 
 from advsearch.errors import FileFormatError
-from advsearch.questions.sweep.carry_out import scenes_of
-from advsearch.questions.sweep.job import OpenScenes
+from advsearch.questions.sweep.carry_out import load_scenes_of_sweep
+from advsearch.questions.sweep.job import SceneLoader
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import CONFIG
@@ -60,14 +60,14 @@ class StoredSweep:
         return rows.sort_values("step", ignore_index=True)
 
     @cached_property
-    def scenes(self) -> OpenScenes:
+    def scenes(self) -> SceneLoader:
         """The scenes, loaded to render images of the sweep again.
 
         Raises:
             InputError, ModelError: a scene or a model is missing.
         """
-        return scenes_of(self.config)
+        return load_scenes_of_sweep(self.config)
 
     def find_thumbnail(self, number: int) -> Path | None:
         """Return the file of an image's stored thumbnail; None if there is none."""
-        return thumbnails.kept_file(self.folder, number)
+        return thumbnails.find_thumbnail(self.folder, number)

@@ -170,7 +170,7 @@ class PairedRates(Fields):
     )
 
 
-class BesideClean(Fields):
+class ArmComparison(Fields):
     """The clean scene and the adversarial one of a run under the same draws."""
 
     answer: str = Field(description="the run")
@@ -188,7 +188,7 @@ class OverDrives(Fields):
     worst: float = Field(description="of the worst drive")
 
 
-class OneDrive(Fields):
+class DriveRecord(Fields):
     """What a model says along one drive."""
 
     row: int = Field(description="number of its first frame among the rows")
@@ -257,7 +257,7 @@ class DriveRates(Fields):
         "what a [tracker](drives.md#tracks) makes of the boxes; absent without a "
         "detector"
     )
-    each: list[OneDrive] = Field(
+    each: list[DriveRecord] = Field(
         default=[], description="the numbers of each drive, the first 1,000"
     )
 
@@ -310,7 +310,7 @@ class SweepSummary(CountedPredictions, RunResult):
         description="over the first two axes with several values; null where there are "
         "fewer, or more than 4096 pairs"
     )
-    beside: BesideClean | None = optional(
+    beside: ArmComparison | None = optional(
         "the clean scene beside [an adversarial "
         "one](sweeps.md#an-adversarial-scene-beside-the-clean-one); absent without"
     )

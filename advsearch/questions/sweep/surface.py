@@ -22,13 +22,13 @@ import torch
 from scipy.special import xlogy
 
 from advsearch import seeds
-from advsearch.attacks.domain import batches
-from advsearch.engine.loading import framed, load_scene
-from advsearch.engine.record import judgement_of
+from advsearch.attacks.domain import split_into_batches
+from advsearch.engine.loading import fit_camera, load_scene
+from advsearch.engine.record import read_judgement
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress
-from advsearch.questions.sweep.job import OpenScenes
-from advsearch.questions.sweep.result import rate
+from advsearch.questions.sweep.job import SceneLoader
+from advsearch.questions.sweep.result import count_independent
 from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
 from advsearch.report.figures import drawn
 from advsearch.report.wording import short_name
@@ -39,14 +39,14 @@ from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import Surfaces
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.surface_parts import CELLS, SurfaceParts
-from advsearch.statistics.intervals import wilson
+from advsearch.scene.surface_parts import MAP_SIZE, SurfaceParts
+from advsearch.statistics.intervals import wilson_interval
 from advsearch.trust.writing import write_bytes
 
 Int64Array = npt.NDArray[np.int64]
 Float64Array = npt.NDArray[np.float64]
 # permutations of the wrong predictions, so that no p-value is under 0.005
-SHARINGS = 199
+N_PERMUTATIONS = 199
 # the chance that any part is significant if none has to do with the predictions
 SIGNIFICANCE_LEVEL = 0.05
 
@@ -55,13 +55,13 @@ class PartCounts:
     """Counts of images and of wrong predictions for n parts of a surface.
 
     Attributes:
-        pictures: images in all.
-        failures: images whose prediction is wrong.
-        seen: (n,) images that show each part.
-        wrong: (n,) failures among these.
-        chance: (SHARINGS, n) the same after each permutation of the failures.
-        exchanged: bits of (SHARINGS, images), packed along the first axis: the
-            permuted failures, from `exchange`; None permutes single images.
+        n_images: images in all.
+        n_failures: images whose prediction is wrong.
+        visible_counts: (n,) images that show each part.
+        wrong_counts: (n,) failures among these.
+        permuted_counts: (SHARINGS, n) the same after each permutation of the failures.
+        permuted_failures: bits of (SHARINGS, images), packed along the first axis: the
+            permuted failures, from `permute_draws`; None permutes single images.
     """
 
     def __init__(
@@ -70,36 +70,38 @@ class PartCounts:
         n_images: int,
         n_failures: int,
         seed: int,
-        exchanged: npt.NDArray[np.uint8] | None = None,
+        permuted_failures: npt.NDArray[np.uint8] | None = None,
     ) -> None:
-        self.exchanged = exchanged
-        self.pictures = n_images
-        self.failures = n_failures
-        self.seen = np.zeros(n_parts, np.int64)
-        self.wrong = np.zeros(n_parts, np.int64)
-        self.chance = np.zeros((SHARINGS, n_parts), np.uint32)
+        self.permuted_failures = permuted_failures
+        self.n_images = n_images
+        self.n_failures = n_failures
+        self.visible_counts = np.zeros(n_parts, np.int64)
+        self.wrong_counts = np.zeros(n_parts, np.int64)
+        self.permuted_counts = np.zeros((N_PERMUTATIONS, n_parts), np.uint32)
         self._images_left = n_images
-        self._failures_left = np.full(SHARINGS, n_failures)
+        self._failures_left = np.full(N_PERMUTATIONS, n_failures)
         self._random = np.random.default_rng(seed)
 
     def add(self, parts: Int64Array, failed: bool) -> None:
         """Count an image, by the indices of the parts that it shows, each once."""
-        self.seen[parts] += 1
-        self.wrong[parts] += failed
-        if self.exchanged is not None:
-            image = self.pictures - self._images_left
-            bits = np.unpackbits(self.exchanged[:, image], count=SHARINGS)
+        self.visible_counts[parts] += 1
+        self.wrong_counts[parts] += failed
+        if self.permuted_failures is not None:
+            image = self.n_images - self._images_left
+            bits = np.unpackbits(self.permuted_failures[:, image], count=N_PERMUTATIONS)
             permuted_failure = bits.astype(bool)
         else:
             # Sequential sampling: each choice of images is equally likely.
-            draw = self._random.random(SHARINGS) * self._images_left
+            draw = self._random.random(N_PERMUTATIONS) * self._images_left
             permuted_failure = draw < self._failures_left
         self._images_left -= 1
         self._failures_left = self._failures_left - permuted_failure
-        self.chance[np.ix_(np.flatnonzero(permuted_failure), parts)] += 1
+        self.permuted_counts[np.ix_(np.flatnonzero(permuted_failure), parts)] += 1
 
 
-def association(counts: PartCounts, part_slice: slice, min_images: int) -> pd.DataFrame:
+def compare_parts(
+    counts: PartCounts, part_slice: slice, min_images: int
+) -> pd.DataFrame:
     """Compare the predictions where a part is visible with those where it is not.
 
     Intervals: Newcombe (1998), method 10. P-values: single-step maximum of the
@@ -119,19 +121,19 @@ def association(counts: PartCounts, part_slice: slice, min_images: int) -> pd.Da
         the bound that is nearer to 0, without its sign, 0 if the interval contains 0.
         Without an interval `strength` is the absolute difference.
     """
-    seen = counts.seen[part_slice]
-    wrong = counts.wrong[part_slice]
-    n_images = counts.pictures
-    n_failures = counts.failures
+    seen = counts.visible_counts[part_slice]
+    wrong = counts.wrong_counts[part_slice]
+    n_images = counts.n_images
+    n_failures = counts.n_failures
     is_compared = (seen >= min_images) & (n_images - seen >= min_images)
     nan_columns = dict.fromkeys(("difference", "low", "high", "p"), np.nan)
-    part_indices = np.arange(len(counts.seen))[part_slice]
+    part_indices = np.arange(len(counts.visible_counts))[part_slice]
     parts = pd.DataFrame(nan_columns, index=part_indices).assign(compared=is_compared)
     if is_compared.any():
         n = seen[is_compared]
         k = wrong[is_compared]
         difference, low, high = _newcombe(k, n, n_failures - k, n_images - n)
-        if counts.exchanged is not None:
+        if counts.permuted_failures is not None:
             low = np.full(len(n), np.nan)
             high = low
         p_value = _permutation_p_value(counts, k, n, part_indices[is_compared])
@@ -157,14 +159,14 @@ def _permutation_p_value(
         n: (m,) these images.
         parts: (m,) indices of the compared parts.
     """
-    images = counts.pictures
-    failures = counts.failures
+    images = counts.n_images
+    failures = counts.n_failures
     max_statistics = np.sort(
         [
             _likelihood_ratio(
                 permuted[parts].astype(np.int64), n, failures, images
             ).max()
-            for permuted in counts.chance
+            for permuted in counts.permuted_counts
         ]
     )
     statistic = _likelihood_ratio(k, n, failures, images)
@@ -202,8 +204,8 @@ def _newcombe(
     """
     rate_1 = k / n
     rate_2 = other_k / other_n
-    lower_1, upper_1 = wilson(rate_1, n)
-    lower_2, upper_2 = wilson(rate_2, other_n)
+    lower_1, upper_1 = wilson_interval(rate_1, n)
+    lower_2, upper_2 = wilson_interval(rate_2, other_n)
     difference = rate_1 - rate_2
     low = difference - np.hypot(rate_1 - lower_1, upper_2 - rate_2)
     high = difference + np.hypot(upper_1 - rate_1, rate_2 - lower_2)
@@ -212,8 +214,8 @@ def _newcombe(
 
 # images that have to show a part, and as many that do not, before its predictions are
 # compared
-LEAST = 5
-MIN_RAYS = 4 * CELLS
+MIN_IMAGES = 5
+MIN_RAYS = 4 * MAP_SIZE
 """Rays along each side of an image, at least: in smaller images, many cells would lie
 between two pixels.
 """
@@ -245,12 +247,12 @@ class SurfaceCounts:
 
     Attributes:
         parts: the parts of the surface.
-        tallies: their counts for each model.
+        part_counts: their counts for each model.
     """
 
     def __init__(self, parts: SurfaceParts, part_counts: Sequence[PartCounts]) -> None:
         self.parts = parts
-        self.tallies = tuple(part_counts)
+        self.part_counts = tuple(part_counts)
 
     def add(self, surfaces: Surfaces, wrong_by_model: Mapping[int, bool]) -> None:
         """Count an image, by its surfaces and whether each model's prediction is wrong.
@@ -259,17 +261,17 @@ class SurfaceCounts:
             surfaces: what the image shows.
             wrong_by_model: by the index of the model.
         """
-        is_object = surfaces.seen(OBJECT)
+        is_object = surfaces.visible_mask(OBJECT)
         face = surfaces.face[is_object].numpy()
         uv = surfaces.uv[is_object].numpy().astype(np.float64)
-        visible_parts = np.unique(self.parts.cells(face, uv))
-        if self.parts.by_face:
-            visible_faces = np.unique(face) + CELLS * CELLS
+        visible_parts = np.unique(self.parts.find_cells(face, uv))
+        if self.parts.counts_faces:
+            visible_faces = np.unique(face) + MAP_SIZE * MAP_SIZE
             visible_parts = np.concatenate([visible_parts, visible_faces])
         for model, failed in wrong_by_model.items():
-            self.tallies[model].add(visible_parts, failed)
+            self.part_counts[model].add(visible_parts, failed)
 
-    def table(
+    def summarize_kind(
         self,
         object_name: str,
         model: str,
@@ -287,7 +289,7 @@ class SurfaceCounts:
             model: its name.
             counts: of the model.
             kind: of the parts, a key of `SurfaceParts.kinds`.
-            compared: from `association`.
+            compared: from `compare_parts`.
         """
         strongest = list[SurfacePart]()
         for has_sign in (compared.difference > 0.0, compared.difference < 0.0):
@@ -302,8 +304,8 @@ class SurfaceCounts:
             object=object_name,
             model=model,
             part=kind,
-            unwrapped=self.parts.unwrapped,
-            seen=int((counts.seen[self.parts.kinds[kind]] > 0).sum()),
+            unwrapped=self.parts.is_unwrapped,
+            seen=int((counts.visible_counts[self.parts.part_slices[kind]] > 0).sum()),
             compared=int(compared.compared.sum()),
             worse=int(is_worse.sum()),
             better=int(is_better.sum()),
@@ -313,7 +315,7 @@ class SurfaceCounts:
     def _select_spread(self, candidates: pd.DataFrame) -> list[int]:
         """Select the strongest parts of which none is close to another."""
         extent = float(np.ptp(self.parts.mesh.vertices, axis=0).max())
-        position = self.parts.place
+        position = self.parts.centers
         selected: list[int] = []
         by_strength = candidates.sort_values("strength", ascending=False, kind="stable")
         for part in by_strength.index:
@@ -328,18 +330,18 @@ class SurfaceCounts:
         self, part: int, tally: PartCounts, compared: pd.DataFrame
     ) -> SurfacePart:
         """Return the counts and the comparison of one part, as the summary has them."""
-        n_visible = int(tally.seen[part])
-        n_visible_wrong = int(tally.wrong[part])
-        n_hidden = tally.pictures - n_visible
-        n_hidden_wrong = tally.failures - n_visible_wrong
-        u, v = self.parts.at[part].tolist()
+        n_visible = int(tally.visible_counts[part])
+        n_visible_wrong = int(tally.wrong_counts[part])
+        n_hidden = tally.n_images - n_visible
+        n_hidden_wrong = tally.n_failures - n_visible_wrong
+        u, v = self.parts.center_uvs[part].tolist()
         return SurfacePart(
             face=int(self.parts.face[part]),
             u=u,
             v=v,
-            place=self.parts.place[part].tolist(),
-            seen=rate(n_visible - n_visible_wrong, n_visible),
-            hidden=rate(n_hidden - n_hidden_wrong, n_hidden),
+            place=self.parts.centers[part].tolist(),
+            seen=count_independent(n_visible - n_visible_wrong, n_visible),
+            hidden=count_independent(n_hidden - n_hidden_wrong, n_hidden),
             difference=float(compared.difference[part]),
             interval=(float(compared.low[part]), float(compared.high[part])),
             p=float(compared.p[part]),
@@ -347,7 +349,7 @@ class SurfaceCounts:
 
 
 def map_surface(
-    scenes: OpenScenes, rows: Iterable[Row], run: RunDirectory, progress: Progress
+    scenes: SceneLoader, rows: Iterable[Row], run: RunDirectory, progress: Progress
 ) -> SurfaceMap:
     """Count wrong predictions over the surface of each object of a sweep.
 
@@ -366,29 +368,29 @@ def map_surface(
     wrong = _read_wrong(scenes, rows)
     assets = {
         named_scene.object: named_scene.scene.description.object
-        for named_scene in job.places
+        for named_scene in job.scenes
     }
     counts = _make_counts(scenes, assets, wrong)
     for scene, wrong_in_scene in enumerate(wrong):
-        scene_counts = counts[job.places[scene].object]
+        scene_counts = counts[job.scenes[scene].object]
         _count_scene(scenes, scene, wrong_in_scene, scene_counts, progress)
     return _write_map(counts, assets, [model.name for model in job.models], run)
 
 
-def _read_wrong(scenes: OpenScenes, rows: Iterable[Row]) -> npt.NDArray[np.int8]:
+def _read_wrong(scenes: SceneLoader, rows: Iterable[Row]) -> npt.NDArray[np.int8]:
     """Return which predictions are wrong: 1, 0 or UNKNOWN, (scenes, images, models)."""
     job = scenes.job
-    shape = (len(job.places), job.per_scene, len(job.models))
+    shape = (len(job.scenes), job.images_per_scene, len(job.models))
     wrong: npt.NDArray[np.int8] = np.full(shape, UNKNOWN, np.int8)
     for row in rows:
         # An image without the object doesn't count as one that hides a part either.
         if row.label != OUT_OF_VIEW:
-            wrong.flat[row.step] = not judgement_of(row).right
+            wrong.flat[row.step] = not read_judgement(row).right
     return wrong
 
 
 def _make_counts(
-    scenes: OpenScenes,
+    scenes: SceneLoader,
     assets: Mapping[str, ObjectAsset],
     wrong: npt.NDArray[np.int8],
 ) -> dict[str, SurfaceCounts]:
@@ -400,14 +402,14 @@ def _make_counts(
         wrong: from `_read_wrong`.
     """
     job = scenes.job
-    units = scenes.open(0).points[job.sizes[0]].units
+    units = scenes.load(0).points[job.image_sizes[0]].units
     image_numbers = np.arange(wrong[..., 0].size)
     draws = np.asarray(units.draw(image_numbers)).reshape(wrong.shape[:2])
     n_models = len(job.models)
     counts = dict[str, SurfaceCounts]()
     for object_index, (name, asset) in enumerate(assets.items()):
         parts = SurfaceParts(asset.mesh)
-        has_object = [named_scene.object == name for named_scene in job.places]
+        has_object = [named_scene.object == name for named_scene in job.scenes]
         model_seeds = [
             seeds.stream(job.config.seed, "surface", object_index * n_models + model)
             for model in range(n_models)
@@ -433,14 +435,14 @@ def _make_part_counts(
         draws: (scenes, images) the draw of each image.
         seed: of the permutations.
     """
-    permuted = exchange(wrong.ravel(), draws.ravel(), seed)
+    permuted = permute_draws(wrong.ravel(), draws.ravel(), seed)
     n_known = int((wrong >= 0).sum())
     n_failures = int((wrong >= 1).sum())
     return PartCounts(parts.count, n_known, n_failures, seed, permuted)
 
 
 def _count_scene(
-    scenes: OpenScenes,
+    scenes: SceneLoader,
     scene: int,
     wrong: npt.NDArray[np.int8],
     counts: SurfaceCounts,
@@ -456,12 +458,14 @@ def _count_scene(
         progress: advances by the number of predictions.
     """
     job = scenes.job
-    swept_scene = scenes.open(scene)
+    swept_scene = scenes.load(scene)
     n_images, n_models = wrong.shape
-    for batch in batches(0, n_images, BATCH_SIZE):
-        for size in dict.fromkeys(job.sizes):
-            models = [model for model in range(n_models) if job.sizes[model] == size]
-            configurations = swept_scene.points[size].configurations(
+    for batch in split_into_batches(0, n_images, BATCH_SIZE):
+        for size in dict.fromkeys(job.image_sizes):
+            models = [
+                model for model in range(n_models) if job.image_sizes[model] == size
+            ]
+            configurations = swept_scene.points[size].make_configurations(
                 batch.start, len(batch), scene * n_images
             )
             rays_per_pixel = ceil(MIN_RAYS / min(size))
@@ -479,7 +483,7 @@ def _select_known(
     return {model: bool(wrong[model]) for model in models if wrong[model] != UNKNOWN}
 
 
-def exchange(
+def permute_draws(
     wrong: npt.NDArray[np.int8], draws: Int64Array, seed: int
 ) -> npt.NDArray[np.uint8] | None:
     """Permute the predictions of full draws among the draws, SHARINGS times.
@@ -501,7 +505,7 @@ def exchange(
         return None
     images_of_draw = np.argsort(draws, kind="stable").reshape(n_draws, -1)
     generator = np.random.default_rng(seed)
-    permuted = np.zeros((SHARINGS, len(wrong)), bool)
+    permuted = np.zeros((N_PERMUTATIONS, len(wrong)), bool)
     for permutation in permuted:
         order = generator.permutation(n_draws)
         permutation[images_of_draw] = (wrong == 1)[images_of_draw[order]]
@@ -531,30 +535,30 @@ def _write_map(
     for number, (name, object_counts) in enumerate(counts.items()):
         comparisons = [
             _compare_kinds(tally, object_counts.parts)
-            for tally in object_counts.tallies
+            for tally in object_counts.part_counts
         ]
         for array_name, array in _stored_arrays(object_counts, comparisons).items():
             arrays[f"{array_name}_{number}"] = array
         panels += _make_panels(assets[name], object_counts, comparisons, name, models)
         for model, tally, frames in zip(
-            models, object_counts.tallies, comparisons, strict=True
+            models, object_counts.part_counts, comparisons, strict=True
         ):
             tables += [
-                object_counts.table(name, model, tally, kind, frame)
+                object_counts.summarize_kind(name, model, tally, kind, frame)
                 for kind, frame in frames.items()
             ]
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)
     write_bytes(run.path / COUNTS_FILE, stream.getvalue())
     _save_figure(panels[:MAX_PANELS], run)
-    return SurfaceMap(file=COUNTS_FILE, cells=CELLS, least=LEAST, tables=tables)
+    return SurfaceMap(file=COUNTS_FILE, cells=MAP_SIZE, least=MIN_IMAGES, tables=tables)
 
 
 def _compare_kinds(counts: PartCounts, parts: SurfaceParts) -> dict[str, pd.DataFrame]:
     """Compare the predictions of a model by the parts of each kind."""
     return {
-        kind: association(counts, part_slice, LEAST)
-        for kind, part_slice in parts.kinds.items()
+        kind: compare_parts(counts, part_slice, MIN_IMAGES)
+        for kind, part_slice in parts.part_slices.items()
     }
 
 
@@ -575,7 +579,9 @@ def _make_panels(
         models: their names.
     """
     views = tuple(_render_views(asset, counts.parts))
-    for model, tally, frames in zip(models, counts.tallies, comparisons, strict=True):
+    for model, tally, frames in zip(
+        models, counts.part_counts, comparisons, strict=True
+    ):
         cells = frames["cell"]
         yield Panel(
             f"{short_name(object_name)}, {short_name(model)}",
@@ -599,14 +605,14 @@ def _stored_arrays(
 
     Args:
         counts: of the object.
-        comparisons: from `association`, by the kind of part, for each model.
+        comparisons: from `compare_parts`, by the kind of part, for each model.
     """
-    tallies = counts.tallies
+    tallies = counts.part_counts
     arrays: dict[str, npt.NDArray[Any]] = {
-        "pictures": np.stack([tally.pictures for tally in tallies]),
-        "failures": np.stack([tally.failures for tally in tallies]),
-        "seen": np.stack([tally.seen for tally in tallies]),
-        "wrong": np.stack([tally.wrong for tally in tallies]),
+        "pictures": np.stack([tally.n_images for tally in tallies]),
+        "failures": np.stack([tally.n_failures for tally in tallies]),
+        "seen": np.stack([tally.visible_counts for tally in tallies]),
+        "wrong": np.stack([tally.wrong_counts for tally in tallies]),
     }
     for column in ("difference", "low", "high", "p"):
         values = [
@@ -622,7 +628,9 @@ def _grey_colors(
     parts: SurfaceParts, tally: PartCounts, cells: pd.DataFrame
 ) -> Float64Array:
     """Return the colors (cells, 3) of cells without a significant difference."""
-    has_surface = parts.covered.ravel() | (tally.seen[parts.kinds["cell"]] > 0)
+    has_surface = parts.is_covered.ravel() | (
+        tally.visible_counts[parts.part_slices["cell"]] > 0
+    )
     is_compared = cells.compared.to_numpy()
     colors = np.where(is_compared[:, None], NOT_SIGNIFICANT_GREY, NOT_COMPARED_GREY)
     return np.where(has_surface[:, None], colors, WHITE)
@@ -683,19 +691,19 @@ class Panel(NamedTuple):
 def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
     """Yield the object by itself from the cameras in `VIEW_ANGLES`."""
     scene_of_object = load_scene(asset, settings={"ground.size": 0.0})
-    description = framed(scene_of_object.description, VIEW_SIZE)
+    description = fit_camera(scene_of_object.description, VIEW_SIZE)
     scene = MitsubaScene(description, (VIEW_SIZE, VIEW_SIZE))
     for azimuth, elevation in VIEW_ANGLES:
         viewed = description.with_values(
             camera__azimuth=azimuth, camera__elevation=elevation
         )
         to_world = camera_to_world(viewed, 1.0).astype(np.float32)
-        surfaces = scene.surfaces({"camera.to_world": torch.from_numpy(to_world)})
-        is_object = surfaces.seen(OBJECT).numpy()
+        surfaces = scene.find_surfaces({"camera.to_world": torch.from_numpy(to_world)})
+        is_object = surfaces.visible_mask(OBJECT).numpy()
         face = surfaces.face.numpy()[is_object]
         uv = surfaces.uv.numpy()[is_object].astype(np.float64)
         cells = np.full(is_object.shape, -1, np.int64)
-        cells[is_object] = parts.cells(face, uv)
+        cells[is_object] = parts.find_cells(face, uv)
         cosine = np.clip(surfaces.normal.numpy() @ np.array(LIGHT_DIRECTION), 0.0, 1.0)
         shade = 0.7 + 0.3 * cosine
         yield MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shade)
@@ -720,7 +728,7 @@ def _draw(panels: Sequence[Panel], figure: Any) -> None:
         scale_colors = scale.to_rgba(panel.difference)[:, :3]
         cell_colors = np.where(is_grey, panel.grey_colors, scale_colors)
         map_axes.imshow(
-            cell_colors.reshape(CELLS, CELLS, 3),
+            cell_colors.reshape(MAP_SIZE, MAP_SIZE, 3),
             extent=(0, 1, 0, 1),
             interpolation="nearest",
         )

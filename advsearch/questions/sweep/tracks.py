@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from advsearch.tasks.boxes import overlap
+from advsearch.tasks.boxes import compute_iou
 
 Float64Array = NDArray[np.float64]
 Step = Callable[[Float64Array, Float64Array], Sequence[tuple[int, Any]]]
@@ -42,7 +42,7 @@ class DetectedFrame(NamedTuple):
     scores: Float64Array
 
 
-class Tracked(NamedTuple):
+class DriveTracking(NamedTuple):
     """What a tracker makes of one drive.
 
     Attributes:
@@ -127,7 +127,7 @@ class ConstantVelocity:
         Returns:
             The tracks with a box, those without, and the boxes without a track.
         """
-        overlap_rows = [overlaps(boxes, track.box) for track in tracks]
+        overlap_rows = [compute_overlaps(boxes, track.box) for track in tracks]
         overlap_table = np.array(overlap_rows).reshape(len(tracks), len(boxes))
         pairs = zip(*linear_sum_assignment(-overlap_table), strict=True)
         box_of_track = {
@@ -150,12 +150,12 @@ class ConstantVelocity:
         return assigned, free_tracks, free_boxes
 
 
-def overlaps(boxes: Float64Array, box: Float64Array) -> Float64Array:
+def compute_overlaps(boxes: Float64Array, box: Float64Array) -> Float64Array:
     """Compute the intersection over union (n,) of boxes (n, 4) with one box (4,)."""
-    return np.asarray(overlap(torch.from_numpy(boxes), torch.from_numpy(box)))
+    return np.asarray(compute_iou(torch.from_numpy(boxes), torch.from_numpy(box)))
 
 
-def frame_of(payload: Any, names: Collection[str]) -> DetectedFrame:
+def read_frame(payload: Any, names: Collection[str]) -> DetectedFrame:
     """Return the boxes that a row of a detector stores.
 
     Args:
@@ -171,7 +171,9 @@ def frame_of(payload: Any, names: Collection[str]) -> DetectedFrame:
     return DetectedFrame(true_box, boxes, scores)
 
 
-def tracked(frames: Sequence[DetectedFrame], tracker: Tracker, iou: float) -> Tracked:
+def track_drive(
+    frames: Sequence[DetectedFrame], tracker: Tracker, iou: float
+) -> DriveTracking:
     """Track the boxes of a drive, and compare the tracks with the true boxes.
 
     Args:
@@ -198,7 +200,9 @@ def tracked(frames: Sequence[DetectedFrame], tracker: Tracker, iou: float) -> Tr
         last_number = number
     gaps = [sum(run) for lost, run in itertools.groupby(is_lost) if lost]
     n_visible = sum(frame.true is not None for frame in frames)
-    return Tracked(sum(is_lost) / max(1, n_visible), n_switches, max(gaps, default=0))
+    return DriveTracking(
+        sum(is_lost) / max(1, n_visible), n_switches, max(gaps, default=0)
+    )
 
 
 def _find_tracks_on(
@@ -208,7 +212,7 @@ def _find_tracks_on(
     if true_box is None:
         return []
     boxes = np.array([box for _, box in tracks], dtype=float).reshape(-1, 4)
-    track_overlaps = overlaps(boxes, true_box).tolist()
+    track_overlaps = compute_overlaps(boxes, true_box).tolist()
     return [
         (track_overlap, number)
         for track_overlap, (number, _) in zip(track_overlaps, tracks, strict=True)

@@ -14,11 +14,15 @@ from advsearch.extend import (
     writing,
 )
 from advsearch.questions.test import result as results
-from advsearch.questions.test.recorded import noted_settings
+from advsearch.questions.test.recorded import read_noted_settings
 from advsearch.questions.test.result import SuiteResult
-from advsearch.questions.test.settings import SuiteConfig, suite_of
+from advsearch.questions.test.settings import SuiteConfig, parse_suite
 
-FORMATS = {"junit": results.junit, "sarif": results.sarif, "markdown": results.markdown}
+FILE_FORMATS = {
+    "junit": results.format_junit,
+    "sarif": results.format_sarif,
+    "markdown": results.format_markdown,
+}
 """Settings that name a file for other programs, and the functions that format it."""
 
 
@@ -32,9 +36,9 @@ FORMATS = {"junit": results.junit, "sarif": results.sarif, "markdown": results.m
     about="suite",
     positional=PositionalArgument("SUITE", "a suite, a YAML file"),
     exit_status=lambda result: result.status,
-    view=results.shown,
-    claims=results.claims,
-    noted_settings=noted_settings,
+    view=results.make_view,
+    claims=results.list_claims,
+    noted_settings=read_noted_settings,
 )
 def test(
     context: RunContext[SuiteConfig], suite: Mapping[str, Any] | None = None
@@ -49,7 +53,9 @@ def test(
     from advsearch.questions.test.carry_out import try_suite  # imports torch
 
     config = context.config
-    files = {name: Path(file) for name in FORMATS if (file := getattr(config, name))}
+    files = {
+        name: Path(file) for name in FILE_FORMATS if (file := getattr(config, name))
+    }
     for name, path in files.items():
         if path.is_dir() or not path.absolute().parent.is_dir():
             raise InputError(
@@ -57,8 +63,8 @@ def test(
                 f"{path}; make the folder first"
             )
     result = try_suite(
-        context, None if suite is None else suite_of(suite, config.suite)
+        context, None if suite is None else parse_suite(suite, config.suite)
     )
     for name, path in files.items():
-        writing.write_text(path, FORMATS[name](result), durable=False)
+        writing.write_text(path, FILE_FORMATS[name](result), durable=False)
     return result

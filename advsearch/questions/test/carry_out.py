@@ -22,25 +22,25 @@ from advsearch.extend import (
     workbench,
 )
 from advsearch.questions.test import counterexamples, settings
-from advsearch.questions.test.claims import Trial, check_pictures
+from advsearch.questions.test.claims import ClaimTester, check_pictures
 from advsearch.questions.test.counterexamples import Counterexample
 from advsearch.questions.test.recorded import SETTINGS_NOTE, SUITE_NOTE
 from advsearch.questions.test.result import (
     FAILED,
-    NOT_TRIED,
-    NOT_YET,
-    STOPPED,
-    TIME_OVER,
+    INTERRUPTED_REASON,
+    NOT_TESTED,
+    NOT_TESTED_YET,
+    OUT_OF_TIME_REASON,
     UNDECIDED,
     Cause,
     ClaimResult,
     SuiteResult,
-    cannot_be_judged,
-    statement,
-    verdict,
+    combine_verdicts,
+    describe_claim,
+    describe_unsuitable,
 )
 from advsearch.questions.test.settings import (
-    COUNTEREXAMPLES,
+    ALL_COUNTEREXAMPLES,
     NotBrokenClaim,
     NoWorseClaim,
     Suite,
@@ -82,7 +82,7 @@ def try_suite(
     loaded_suite = _read_noted_suite(context.resumed) or suite or _read_suite(config)
     added = None
     if config.add is not None:
-        added = counterexamples.add(config.suite, config.add)
+        added = counterexamples.add_counterexample(config.suite, config.add)
     try:
         planned = _plan_claims(loaded_suite, config, added)
         if loaded_suite is not suite:
@@ -91,16 +91,16 @@ def try_suite(
         remarks = _check_claims(planned, loaded_suite)
     except InputError as error:
         if added is not None:
-            counterexamples.remove(added)
+            counterexamples.delete_counterexample(added)
         raise InputError(f"{config.suite}: {error}") from None
     _note_settings(context, loaded_suite, planned)
     for remark in remarks:
         context.progress.message(remark)
-    trial = Trial(context, loaded_suite, start, remarks)
+    trial = ClaimTester(context, loaded_suite, start, remarks)
     suite_run = _SuiteRun(trial, planned, counterexamples.read_expected(config.suite))
     context.ending = suite_run.run_claims()
     if added is not None and suite_run.results[0].answer != FAILED:
-        counterexamples.remove(added)
+        counterexamples.delete_counterexample(added)
         raise InputError(
             f"add: the adversarial scene of {config.add} is not kept: "
             f"{suite_run.results[0].reason}"
@@ -119,7 +119,7 @@ def _read_noted_suite(resumed: Path | None) -> Suite | None:
         noted = store.noted(SUITE_NOTE)
     if noted is None:
         return None
-    return settings.suite_of(noted, f"{resumed}: the suite that it began with")
+    return settings.parse_suite(noted, f"{resumed}: the suite that it began with")
 
 
 def _read_suite(config: SuiteConfig) -> Suite:
@@ -138,14 +138,14 @@ def _note_settings(
     run = context.run
     run.store.set_note(SUITE_NOTE, json.dumps(suite.model_dump(mode="json")))
     judged_with = {
-        claim.name: claim.config.deciding()
+        claim.name: claim.config.get_deciding_settings()
         for claim in planned
         if claim.example is not None
     }
     run.store.set_note(SETTINGS_NOTE, json.dumps(judged_with))
     used_settings = list[dict[str, Any]]()
     for claim in planned:
-        used_settings.append(claim.config.plain())
+        used_settings.append(claim.config.to_json())
         tested = None if claim.example is not None else suite.claims[claim.name]
         if isinstance(tested, NoWorseClaim):
             used_settings.append({"model": tested.than})
@@ -156,7 +156,7 @@ def _note_settings(
 class _SuiteRun:
     """The state of a suite that is being tested: what is planned, and results so far."""
 
-    trial: Trial
+    trial: ClaimTester
     planned: Sequence[PlannedClaim]
     expected: Mapping[str, str]
     results: list[ClaimResult] = field(default_factory=list)
@@ -174,7 +174,9 @@ class _SuiteRun:
                     trial.run.write_summary(self.make_result(results.INTERRUPTED, None))
         if trial.context.ending == results.INTERRUPTED:
             for claim in self.planned[len(self.results) :]:
-                untested = self._make_untested(claim, STOPPED, Cause.INTERRUPTED)
+                untested = self._make_untested(
+                    claim, INTERRUPTED_REASON, Cause.INTERRUPTED
+                )
                 self._add_result(claim, untested)
             return results.INTERRUPTED
         causes = {tested.cause for tested in self.results}
@@ -197,20 +199,22 @@ class _SuiteRun:
             for known in self.results
         )
         if counterexample_failed and claim.example is None and not trial.config.all:
-            return self._make_untested(claim, NOT_TRIED, Cause.COUNTEREXAMPLE_FAILED)
-        if trial.late:
+            return self._make_untested(claim, NOT_TESTED, Cause.COUNTEREXAMPLE_FAILED)
+        if trial.out_of_time:
             return self._make_untested(
-                claim, f"{TIME_OVER} before it began", Cause.OUT_OF_TIME
+                claim, f"{OUT_OF_TIME_REASON} before it began", Cause.OUT_OF_TIME
             )
         if claim.refusal:
             return self._make_untested(claim, claim.refusal)
         pending = self._make_untested(claim, "")
         start = time.perf_counter()
         if claim.example is None:
-            tested = trial.claim(pending, trial.suite.claims[claim.name], claim.config)
+            tested = trial.test_claim(
+                pending, trial.suite.claims[claim.name], claim.config
+            )
         else:
             assert isinstance(claim.config, AttackConfig)
-            tested = trial.counterexample(pending, claim.example, claim.config)
+            tested = trial.test_counterexample(pending, claim.example, claim.config)
         if tested.cause is Cause.INTERRUPTED:
             raise KeyboardInterrupt
         tested = tested.model_copy(update={"seconds": time.perf_counter() - start})
@@ -224,7 +228,7 @@ class _SuiteRun:
         """Make the result of a claim that is not tested, or not yet."""
         text = ""
         if claim.example is None:
-            text = statement(self.trial.suite.claims[claim.name], claim.config)
+            text = describe_claim(self.trial.suite.claims[claim.name], claim.config)
         return ClaimResult(
             name=claim.name,
             kind=claim.kind,
@@ -268,7 +272,7 @@ class _SuiteRun:
         changes = list[str]()
         claims = list(self.results)
         for claim in self.planned[len(self.results) :]:
-            claims.append(self._make_untested(claim, NOT_YET, Cause.NOT_REACHED))
+            claims.append(self._make_untested(claim, NOT_TESTED_YET, Cause.NOT_REACHED))
         if config.update and ending == "done":
             answers = {
                 claim.name: claim.answer
@@ -288,16 +292,16 @@ class _SuiteRun:
             title=trial.suite.title,
             object=_join_distinct(config.object for config in configs),
             model=_join_distinct(config.model for config in configs),
-            environment=_join_distinct(config.lit_by for config in configs),
+            environment=_join_distinct(config.environment_name for config in configs),
             controls=list(dict.fromkeys(controls)),
-            answer=verdict(claims),
+            answer=combine_verdicts(claims),
             confidence=trial.suite.confidence,
             claims=claims,
             ending=ending,
             added=None if added is None else str(added.path),
             changes=changes,
             warnings=list(dict.fromkeys(trial.warnings)),
-            seconds={"total": trial.passed},
+            seconds={"total": trial.elapsed_seconds},
             seed=trial.suite.seed,
             command_line=self._repeat_command(),
             python_only=config.python_only,
@@ -323,7 +327,7 @@ def _plan_claims(
         "deterministic": config.deterministic or None,
     }
     if added is None:
-        examples = counterexamples.counterexamples(config.suite)
+        examples = counterexamples.read_counterexamples(config.suite)
     else:
         examples = [added]
     planned = [_plan_example(example, suite, changes) for example in examples]
@@ -336,7 +340,7 @@ def _plan_claims(
     if added is not None:
         return planned
     for name, suite_claim in suite.claims.items():
-        claim_config = suite.config_of(name, **changes).with_python_parts_of(config)
+        claim_config = suite.make_config(name, **changes).with_python_parts_of(config)
         planned.append(PlannedClaim(name, suite_claim.claim, claim_config))
     return _select_claims(planned, config)
 
@@ -349,20 +353,26 @@ def _select_claims(
     Raises:
         InputError: if it names no claim, or none is left.
     """
-    known = [*(claim.name for claim in planned), COUNTEREXAMPLES]
-    for name in config.chosen:
+    known = [*(claim.name for claim in planned), ALL_COUNTEREXAMPLES]
+    for name in config.selected_claims:
         if name not in known:
             raise errors.UnknownNameError("claim in `only`", name, known)
     selected = []
     for claim in planned:
-        is_example = claim.example is not None and COUNTEREXAMPLES in config.chosen
-        if not config.chosen or claim.name in config.chosen or is_example:
+        is_example = (
+            claim.example is not None and ALL_COUNTEREXAMPLES in config.selected_claims
+        )
+        if (
+            not config.selected_claims
+            or claim.name in config.selected_claims
+            or is_example
+        ):
             selected.append(claim)
     if not selected:
         raise InputError(
-            f"only: expected {COUNTEREXAMPLES} in "
-            f"{counterexamples.folder_of(config.suite)}, got none, so that nothing "
-            "would be tested; keep the adversarial scene of a run with `add`, or leave "
+            f"only: expected {ALL_COUNTEREXAMPLES} in "
+            f"{counterexamples.counterexample_directory(config.suite)}, got none, so that nothing "
+            "would be tested; keep the adversarial scene of a run with `add_counterexample`, or leave "
             "`only` out"
         )
     return selected
@@ -374,10 +384,10 @@ def _plan_example(
     """Plan the test of a counterexample, which may not suit the model."""
     refusal = ""
     try:
-        config = example.config_for(suite, changes)
+        config = example.make_config(suite, changes)
     except InputError as error:
         config = example.config
-        refusal = cannot_be_judged(str(error))
+        refusal = describe_unsuitable(str(error))
     return PlannedClaim(example.name, "counterexample", config, example, refusal)
 
 
@@ -404,7 +414,7 @@ def _check_claims(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
     for planned_claim, claim in claims:
         config = planned_claim.config
         if not isinstance(config, AttackConfig):
-            config = AttackConfig.of(config)
+            config = AttackConfig.from_config(config)
         needed = [config]
         if isinstance(claim, NotBrokenClaim):
             _check_search(planned_claim.name, config)

@@ -33,17 +33,17 @@ from advsearch.extend import (
 from advsearch.questions.test import result as words
 from advsearch.questions.test import settings as suites
 from advsearch.questions.test.counterexamples import (
-    TRIALS,
+    N_TRIALS,
     Counterexample,
+    compute_scene_digest,
     decide_trials,
-    is_over,
-    outcome_of,
-    scene_digest,
+    evaluate_trial,
+    varies_conditions,
 )
 from advsearch.questions.test.result import (
     FAILED,
     HELD,
-    TIME_OVER,
+    OUT_OF_TIME_REASON,
     UNDECIDED,
     Cause,
     ClaimResult,
@@ -57,13 +57,13 @@ from advsearch.questions.test.settings import (
 )
 
 # maximum number of values of a configuration in a sentence
-MANY = 4
+MAX_DESCRIBED_VALUES = 4
 # the values of a configuration with more dimensions are not stored with its picture
-MOST_KEPT = 64
+MAX_STORED_VALUES = 64
 ChangePicture = Callable[["workbench.Query", Tensor], Tensor]
 """Maps a query and its picture to the picture that the other side predicts."""
 # pictures that are requested at once, for each worker
-AHEAD = 2
+BATCHES_AHEAD = 2
 Evaluated = tuple["workbench.Query", policies.Evaluation, policies.Evaluation | None]
 """A query, its evaluation, and that of the other side if there is one."""
 ATTACK_WORKER = "advsearch.questions.attack.carry_out:attack_worker"
@@ -71,19 +71,19 @@ CLAIM_WORKER = "advsearch.questions.test.claims:claim_worker"
 
 
 @dataclass
-class Trial:
+class ClaimTester:
     """Tests the claims of a suite.
 
     Attributes:
         context: context of the run.
         suite: the suite.
-        begun: when it began, by `time.perf_counter`.
+        start_time: when it began, by `time.perf_counter`.
         warnings: gets what a reader has to know.
     """
 
     context: RunContext[suites.SuiteConfig]
     suite: suites.Suite
-    begun: float
+    start_time: float
     warnings: list[str]
 
     @property
@@ -99,21 +99,21 @@ class Trial:
         return self.context.progress
 
     @property
-    def passed(self) -> float:
+    def elapsed_seconds(self) -> float:
         """The seconds since it began."""
-        return time.perf_counter() - self.begun
+        return time.perf_counter() - self.start_time
 
     @property
-    def seconds(self) -> float:
+    def time_limit(self) -> float:
         """The seconds after which nothing more begins; infinite without a limit."""
         return self.config.seconds or self.suite.seconds or math.inf
 
     @property
-    def late(self) -> bool:
+    def out_of_time(self) -> bool:
         """Whether the time is over."""
-        return self.passed >= self.seconds
+        return self.elapsed_seconds >= self.time_limit
 
-    def claim(
+    def test_claim(
         self, pending: ClaimResult, claim: AnyClaim, config: SceneConfig
     ) -> ClaimResult:
         """Test a claim, and return its result.
@@ -132,19 +132,21 @@ class Trial:
         self, pending: ClaimResult, config: AttackConfig
     ) -> ClaimResult:
         """Test by a search, which runs as a part of this run, that nothing breaks a model."""
-        remaining = max(0.001, self.seconds - self.passed)
+        remaining = max(0.001, self.time_limit - self.elapsed_seconds)
         seconds = min(remaining, config.seconds or math.inf)
         changes = {
             "workers": self.config.workers,
             "cluster": self.config.cluster,
             "seconds": seconds if math.isfinite(seconds) else None,
         }
-        search = config.model_copy(update=changes).with_only_here(config.only_here)
+        search = config.model_copy(update=changes).with_python_only_parts(
+            config.python_only_parts
+        )
         summary = self.context.run_part(pending.name, search)
         assert isinstance(summary, workbench.AttackSummary)
         self.warnings += summary.warnings
         planned = search.model_copy(update={"steps": search.steps or summary.steps})
-        verdict, reason, cause = words.search_verdict(summary, planned)
+        verdict, reason, cause = words.evaluate_search(summary, planned)
         image_name = "clean" if summary.ending == "already wrong" else "adversarial"
         part = self.run.locate_part(self.run.path, pending.name)
         image = part / "images" / f"{image_name}.png"
@@ -191,8 +193,8 @@ class Trial:
                 if value is None:
                     n_hidden += 1
                     continue
-                if not evaluation.said.right:
-                    wrong_payloads.append(evaluation.said.payload)
+                if not evaluation.required_judgement.right:
+                    wrong_payloads.append(evaluation.required_judgement.payload)
                 sequence.add(value)
                 values.append(value)
                 if value == 0.0 and (worst is None or badness > worst[0]):
@@ -207,14 +209,14 @@ class Trial:
             _, query, text = worst
             example = f"{text}: {self._describe(problem, query)}"
             picture = self._save_picture(pending.name, problem, query)
-        is_late = verdict == UNDECIDED and self.late
+        is_late = verdict == UNDECIDED and self.out_of_time
         reason = _picture_reason(
             claim, verdict, values, sequence.interval, example, wrong_payloads, problem
         )
         if n_hidden:
             reason += f"; the object is not to be seen in {n_hidden} more, which are not counted"
         if is_late:
-            reason += f"; {TIME_OVER}"
+            reason += f"; {OUT_OF_TIME_REASON}"
         return pending.model_copy(
             update={
                 "answer": verdict,
@@ -237,7 +239,7 @@ class Trial:
         problem: Problem,
     ) -> Iterator[Iterator[Evaluated]]:
         """Open the workers that evaluate sampled pictures, of one or of two models."""
-        shared = AttackConfig.of(
+        shared = AttackConfig.from_config(
             config, workers=self.config.workers, cluster=self.config.cluster
         )
         worker = ATTACK_WORKER
@@ -263,15 +265,15 @@ class Trial:
         queries = sample_queries(
             problem, f"claim {name}", claim.pictures, samples_per_pixel(config)
         )
-        with workbench.executor_for(shared, worker, self.progress) as executor:
+        with workbench.open_executor(shared, worker, self.progress) as executor:
             problem_name = "0" if has_two_models else ""
-            evaluator = workbench.Shared(problem, executor, problem_name)
+            evaluator = workbench.ParallelEvaluator(problem, executor, problem_name)
             journal = workbench.Journal(self.run, evaluator)
             other_journal = None
             if not isinstance(claim, RightClaim):
-                other_evaluator = workbench.Shared(other)
+                other_evaluator = workbench.ParallelEvaluator(other)
                 if has_two_models:
-                    other_evaluator = workbench.Shared(other, executor, "1")
+                    other_evaluator = workbench.ParallelEvaluator(other, executor, "1")
                 other_journal = workbench.Journal(self.run, other_evaluator)
             yield self._evaluate_pairs(journal, queries, other_journal, change)
 
@@ -279,12 +281,12 @@ class Trial:
         self, claim: ChangeClaim, config: SceneConfig, problem: Problem
     ) -> ChangePicture:
         """Return the function that changes the picture of a query as claimed."""
-        if claim.when != workbench.AWAY:
-            return lambda query, picture: workbench.changed(
+        if claim.when != workbench.WITHOUT_OBJECT:
+            return lambda query, picture: workbench.change_image(
                 picture, claim.when, problem.model.cameras
             )
         other = self._load_problem(config)
-        other.renderer.scene.assembly.away = True
+        other.renderer.scene.assembly.is_object_hidden = True
         return lambda query, picture: other.picture(query.u, query.seed, query.spp)
 
     def _evaluate_pairs(
@@ -310,8 +312,8 @@ class Trial:
         def evaluate(
             queries: Sequence[workbench.Query],
         ) -> Iterator[policies.Evaluation]:
-            evaluations = journal.traced(
-                [replace(query, keep=change is not None) for query in queries]
+            evaluations = journal.evaluator(
+                [replace(query, with_image=change is not None) for query in queries]
             )
             for query, evaluation in zip(queries, evaluations, strict=True):
                 pictures[query.number] = evaluation.picture
@@ -322,21 +324,23 @@ class Trial:
         ) -> Iterable[policies.Evaluation]:
             assert other_journal is not None
             if change is None:
-                yield from other_journal.traced(queries)
+                yield from other_journal.evaluator(queries)
                 return
-            problem = journal.traced.problem
-            other = other_journal.traced.problem
+            problem = journal.evaluator.problem
+            other = other_journal.evaluator.problem
             for query in queries:
                 # an evaluation that was read back has no picture
                 picture = pictures.get(query.number)
                 if picture is None:
                     picture = problem.picture(query.u, query.seed, query.spp)
-                judgement = other.judge(change(query, picture), other.whole(query.u))
-                yield policies.Evaluation.of(judgement)
+                judgement = other.judge(
+                    change(query, picture), other.add_conditions(query.u)
+                )
+                yield policies.Evaluation.from_judgement(judgement)
 
         batch_size = 1
-        if journal.traced.executor is not None:
-            batch_size = AHEAD * (self.config.workers or 8)
+        if journal.evaluator.executor is not None:
+            batch_size = BATCHES_AHEAD * (self.config.workers or 8)
         while batch := list(islice(queries, batch_size)):
             pictures.clear()
             evaluations = journal.evaluate_all(batch, evaluate)
@@ -351,12 +355,12 @@ class Trial:
             for query, evaluation, other in zip(
                 batch, evaluations, others, strict=False
             ):
-                self.progress.advance(1, **journal.traced.told)
+                self.progress.advance(1, **journal.evaluator.progress_stats)
                 yield query, evaluation, other
-            if self.late:
+            if self.out_of_time:
                 return
 
-    def counterexample(
+    def test_counterexample(
         self, pending: ClaimResult, example: Counterexample, config: AttackConfig
     ) -> ClaimResult:
         """Test a counterexample: the model should be right on it.
@@ -368,29 +372,31 @@ class Trial:
         """
         pending = pending.model_copy(
             update={
-                "statement": f"{config.model} is right where it said {example.said}"
+                "statement": f"{config.model} is right where it said {example.wrong_label}"
             }
         )
         try:
-            parts = workbench.parts_of(config)
-            problem = workbench.problem_on(parts, differentiated=False)
+            parts = workbench.load_parts(config)
+            problem = workbench.make_problem(parts, differentiated=False)
         except InputError as error:
-            reason = words.cannot_be_judged(str(error))
+            reason = words.describe_unsuitable(str(error))
             return pending.model_copy(update={"reason": reason})
-        file = example.changed_file(config)
+        file = example.find_changed_file(config)
         if file:
             reason = (
                 f"the file {file} is another one now; put it back, or remove the "
                 "counterexample"
             )
             return pending.model_copy(update={"reason": reason})
-        if scene_digest(parts.scene.description) != example.scene:
+        if compute_scene_digest(parts.scene.description) != example.scene_digest:
             reason = (
                 "its scene is another one now; remove it, or add the adversarial "
                 "scene of a new run"
             )
             return pending.model_copy(update={"reason": reason})
-        return self._test_by_trials(pending, example, problem, over=is_over(config))
+        return self._test_by_trials(
+            pending, example, problem, over=varies_conditions(config)
+        )
 
     def _test_by_trials(
         self,
@@ -401,21 +407,21 @@ class Trial:
         over: bool,
     ) -> ClaimResult:
         """Test a counterexample by fresh renders; with `over`, under many conditions."""
-        u = problem.domain.project(example.configuration(problem.domain.start))
+        u = problem.domain.project(example.make_configuration(problem.domain.start))
         # trials by which it is added are not repeated as trials of the suite
         prefix = "added " if self.config.add is not None else ""
         kind = f"{prefix}counterexample {example.name}"
-        journal = workbench.Journal(self.run, workbench.Shared(problem))
+        journal = workbench.Journal(self.run, workbench.ParallelEvaluator(problem))
         outcomes = list[bool | None]()
         wrong_payloads = list[Any]()
         label = ""
         picture: str | None = None
-        max_trials = 4 * TRIALS[over] if over else TRIALS[over]
+        max_trials = 4 * N_TRIALS[over] if over else N_TRIALS[over]
         self.progress.stage(example.name, max_trials, at_most=True)
         for query, trial, clean in self._run_trials(
             journal, kind, u, example.spp, over=over
         ):
-            outcome = outcome_of(trial, clean)
+            outcome = evaluate_trial(trial, clean)
             outcomes.append(outcome)
             if outcome is False:
                 wrong_payloads.append(trial.payload)
@@ -426,10 +432,12 @@ class Trial:
                 break
 
         update = _trials_result(outcomes, label, wrong_payloads, problem, over=over)
-        if self.late and not _has_enough_trials(outcomes, over=over):
+        if self.out_of_time and not _has_enough_trials(outcomes, over=over):
             update["answer"] = UNDECIDED
             update["reason"] = (
-                f"{update['reason']}; {TIME_OVER}" if outcomes else TIME_OVER
+                f"{update['reason']}; {OUT_OF_TIME_REASON}"
+                if outcomes
+                else OUT_OF_TIME_REASON
             )
             update["cause"] = Cause.OUT_OF_TIME
         update["picture"] = picture
@@ -445,7 +453,7 @@ class Trial:
         """
         problem = journal.problem
         queries = list[workbench.Query]()
-        for index in range(2 * TRIALS[over]):
+        for index in range(2 * N_TRIALS[over]):
             seed = seeds.stream(self.suite.seed, kind, index)
             query = workbench.Query(u, seed, kind, index, spp=spp)
             queries.append(query)
@@ -457,35 +465,37 @@ class Trial:
         evaluated = self._evaluate_pairs(journal, iter(queries))
         for query, trial, _ in evaluated:
             if not over:
-                yield query, trial.said, None
+                yield query, trial.required_judgement, None
                 continue
             clean = next(evaluated, None)
             if clean is None:
                 return
-            yield query, trial.said, clean[1].said
+            yield query, trial.required_judgement, clean[1].required_judgement
 
     def _load_problem(self, config: SceneConfig) -> Problem:
         """Load scene, model and task; what there is to remark becomes a warning."""
-        parts = workbench.parts_of(AttackConfig.of(config))
+        parts = workbench.load_parts(AttackConfig.from_config(config))
         # without the remarks of the task, which the reason has
-        remarks = [*parts.loaded[1]]
-        problem = workbench.problem_on(parts, differentiated=False)
-        self.warnings += [*problem.space.notes(parts.scene.description), *remarks]
+        remarks = [*parts.model_and_warnings[1]]
+        problem = workbench.make_problem(parts, differentiated=False)
+        self.warnings += [*problem.space.list_notes(parts.scene.description), *remarks]
         return problem
 
     def _save_picture(self, name: str, problem: Problem, query: workbench.Query) -> str:
         """Save the picture of a query, and return its path inside the run."""
-        picture = problem.picture(query.u, query.seed, query.spp, drawn=query.drawn)
+        picture = problem.picture(
+            query.u, query.seed, query.spp, with_conditions=query.draws_conditions
+        )
         return self.run.save_image(name, picture).relative_to(self.run.path).as_posix()
 
     def _describe(self, problem: Problem, query: workbench.Query) -> str:
         """Describe the first values of a configuration: ``pose.yaw 12.5 deg, ...``."""
         values = list(problem.describe(query.u, query.seed).items())
         texts = []
-        for name, value in values[:MANY]:
+        for name, value in values[:MAX_DESCRIBED_VALUES]:
             unit = "" if value["unit"] in ("1", "name") else f" {value['unit']}"
             texts.append(f"{name} {wording.number_text(value['value'])}{unit}")
-        if len(values) > MANY:
+        if len(values) > MAX_DESCRIBED_VALUES:
             texts.append("...")
         return ", ".join(texts)
 
@@ -499,9 +509,11 @@ def claim_worker(values: dict[str, Any]) -> Callable[[Any], Any]:
 
     def load_problem(name: str) -> Problem:
         config = AttackConfig(**{**values, "model": models[int(name)]})
-        return workbench.problem_on(workbench.parts_of(config), differentiated=False)
+        return workbench.make_problem(
+            workbench.load_parts(config), differentiated=False
+        )
 
-    return workbench.worker_call(cache(load_problem))
+    return workbench.make_worker_call(cache(load_problem))
 
 
 def sample_queries(
@@ -517,9 +529,11 @@ def sample_queries(
         )
         (u,) = problem.domain.sample(generator)
         seed = seeds.stream(problem.seed, kind, index)
-        values = problem.describe(u, seed) if problem.domain.dim <= MOST_KEPT else {}
+        values = (
+            problem.describe(u, seed) if problem.domain.dim <= MAX_STORED_VALUES else {}
+        )
         yield workbench.Query(
-            u, seed, kind, index, spp=spp, values=values, sought=False
+            u, seed, kind, index, spp=spp, values=values, has_success=False
         )
 
 
@@ -543,7 +557,7 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
         return ""
     threshold = threshold_mean(claim)
     needed = max(
-        statistics.sequential.draws_needed(mean, confidence=confidence)
+        statistics.sequential.count_needed_samples(mean, confidence=confidence)
         for mean in (threshold, 1.0 - threshold)
     )
     if claim.pictures < needed:
@@ -555,7 +569,7 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
         )
     if not isinstance(claim, NoWorseClaim):
         return ""
-    needed_if_equal = statistics.sequential.draws_needed(
+    needed_if_equal = statistics.sequential.count_needed_samples(
         threshold, confidence=confidence, value=0.5
     )
     if claim.pictures >= needed_if_equal:
@@ -582,25 +596,29 @@ def score_picture(
         The score from 0 to 1, None if the object is out of view; how bad an example
         against the claim it is; and a description of that.
     """
-    before = evaluation.said.prediction
+    before = evaluation.required_judgement.prediction
     # pictures of two sizes need not show the same
     is_hidden_from_other = (
         isinstance(claim, NoWorseClaim)
         and other is not None
-        and other.said.prediction.is_out_of_view
+        and other.required_judgement.prediction.is_out_of_view
     )
     if before.is_out_of_view or is_hidden_from_other:
         return None, 0.0, ""
     if other is None:
-        score = evaluation.said.score
+        score = evaluation.required_judgement.score
         badness = score if math.isfinite(score) else -math.inf
         text = f"most wrong where it says {before.label}"
-        return float(evaluation.said.right), badness, text
+        return float(evaluation.required_judgement.right), badness, text
     if isinstance(claim, ChangeClaim):
-        after = other.said.prediction
+        after = other.required_judgement.prediction
         text = f"{before.label} before and {after.label} after"
-        return float(workbench.as_claimed(claim.claim, before, after)), 0.0, text
-    return (evaluation.said.right - other.said.right + 1) / 2, 0.0, ""
+        return float(workbench.meets_claim(claim.claim, before, after)), 0.0, text
+    return (
+        (evaluation.required_judgement.right - other.required_judgement.right + 1) / 2,
+        0.0,
+        "",
+    )
 
 
 def _decide(
@@ -644,7 +662,7 @@ def _picture_reason(
     if isinstance(claim, NoWorseClaim):
         lower, upper = _to_claim_scale(claim, *interval)
         counts = (len(values), values.count(1.0), values.count(0.0))
-        return words.difference_reason(verdict, counts, (lower, upper), claim.than)
+        return words.describe_difference(verdict, counts, (lower, upper), claim.than)
     what = "as claimed"
     outcomes = ""
     if isinstance(claim, RightClaim):
@@ -652,7 +670,7 @@ def _picture_reason(
         outcomes = wording.outcomes_text(
             workbench.count_outcomes(wrong_payloads), problem.task.name
         )
-    return words.share_reason(
+    return words.describe_fraction(
         what, verdict, values.count(1.0), len(values), interval, example, outcomes
     )
 
@@ -665,7 +683,7 @@ def _has_enough_trials(outcomes: Sequence[bool | None], *, over: bool) -> bool:
     n_right = outcomes.count(True)
     n_wrong = outcomes.count(False)
     depends_on_noise = n_right > 0 and n_wrong > 0 and not over
-    return depends_on_noise or n_right + n_wrong == TRIALS[over]
+    return depends_on_noise or n_right + n_wrong == N_TRIALS[over]
 
 
 def _trials_result(
@@ -686,7 +704,7 @@ def _trials_result(
     if total:
         interval = statistics.intervals.clopper_pearson(n_right, total)
         rate = n_right / total
-    reason = words.tried_reason(
+    reason = words.describe_trials(
         verdict,
         (n_right, n_wrong, outcomes.count(None)),
         label,
@@ -712,5 +730,5 @@ def _same_picture(_query: workbench.Query, picture: Tensor) -> Tensor:
 
 def samples_per_pixel(config: SceneConfig) -> int:
     """Return the samples per pixel of a claim's pictures."""
-    assert isinstance(config, suites.DrawnConfig)
-    return workbench.ladder_of(config.verify_spp, config.pixel_sampler)[0]
+    assert isinstance(config, suites.SampledConfig)
+    return workbench.choose_ladder(config.verify_spp, config.pixel_sampler)[0]

@@ -46,13 +46,13 @@ from advsearch.questions.test.settings import Suite
 
 Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
 
-FEW = 4096
-FINE = 1.0 / 32767.0
-COARSE = 1.0 / 255.0
+MAX_FINE_VALUES = 4096
+FINE_STEP = 1.0 / 32767.0
+COARSE_STEP = 1.0 / 255.0
 """Limits of quantization.
 
-A block of up to `FEW` values is stored in steps of `FINE`. A larger one, such as the
-texels of a texture, has one of `FORMS`, at best in steps of `COARSE`.
+A block of up to `MAX_FINE_VALUES` values is stored in steps of `FINE_STEP`. A larger one, such as the
+texels of a texture, has one of `FORMS`, at best in steps of `COARSE_STEP`.
 """
 
 FORMS = ((True, 4), (True, 2), (True, 1), (False, 1))
@@ -63,24 +63,24 @@ the squares of texels that share a value.
 """
 
 # suffix of the picture
-PICTURE = ".jpg"
+PICTURE_SUFFIX = ".jpg"
 # longest side of the picture, pixels
 THUMBNAIL_SIDE = 128
 # maximum bytes of a file, and maximum values of a configuration
-LARGEST = 1 << 24
+MAX_SIZE = 1 << 24
 # maximum bytes of memory to decompress a block
-MEMORY = 1 << 27
+MAX_MEMORY = 1 << 27
 # fresh renders that test a scene, and one under many conditions
-TRIALS = {False: 6, True: 20}
+N_TRIALS = {False: 6, True: 20}
 
-OF_MODEL = ("model", "labels", "prompt", "value_range", "ask", "ensemble")
+MODEL_SETTINGS = ("model", "labels", "prompt", "value_range", "ask", "ensemble")
 """Settings of the network under test.
 
 They go together: if the suite names a model, all are the suite's.
 """
 
-OF_SUITE = (
-    *settings.PLACE,
+SUITE_SETTINGS = (
+    *settings.RUN_LOCATION,
     "threads",
     "deterministic",
     "workers",
@@ -90,7 +90,7 @@ OF_SUITE = (
 )
 """Settings of how and where a run computes."""
 
-OF_SEARCH = (
+SEARCH_SETTINGS = (
     *(
         "policy",
         "steps",
@@ -109,7 +109,7 @@ OF_SEARCH = (
 The samples of its verification are stored separately.
 """
 
-NOT_DECIDING = frozenset({*OF_SUITE, *OF_SEARCH, "ask"})
+NOT_DECIDING = frozenset({*SUITE_SETTINGS, *SEARCH_SETTINGS, "ask"})
 """The only settings of a run that are not stored with its adversarial scene.
 
 Every other one may decide a verdict; a new setting is stored unless it is listed here.
@@ -120,49 +120,49 @@ class _Block(BaseModel):
     """Quantized offsets of some values from the clean scene; see `FORMS`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    numbers: int = Field(ge=1, le=LARGEST)
+    numbers: int = Field(ge=1, le=MAX_SIZE)
     step: float = Field(gt=0.0, le=1.0)
     signs: bool
     square: int = Field(ge=1, le=4)
     offsets: str
 
     @classmethod
-    def of(cls, moved: Floats, signs: bool, square: int) -> _Block:
+    def quantize(cls, values: Floats, signs: bool, square: int) -> _Block:
         """Quantize and compress offsets (n,).
 
         Args:
-            moved: the offsets.
+            values: the offsets.
             signs: whether to store only signs; ignored for few values.
             square: side of the squares of texels that share a value; ignored unless they
                 tile a texture (side, side, 3).
         """
-        is_small = len(moved) <= FEW
-        side = isqrt(len(moved) // 3)
-        is_texture = not is_small and 3 * side * side == len(moved)
+        is_small = len(values) <= MAX_FINE_VALUES
+        side = isqrt(len(values) // 3)
+        is_texture = not is_small and 3 * side * side == len(values)
         if not is_texture or side % square != 0:
             square = 1
-        step = COARSE
+        step = COARSE_STEP
         if is_small:
-            step = FINE
+            step = FINE_STEP
         elif signs:
-            step = float(np.abs(moved).max())
+            step = float(np.abs(values).max())
         if square > 1:
-            squares = moved.reshape(side // square, square, side // square, square, 3)
-            moved = squares.mean(axis=(1, 3)).ravel()
-        steps = np.round(moved / (step or 1.0)).astype("<i2")
+            squares = values.reshape(side // square, square, side // square, square, 3)
+            values = squares.mean(axis=(1, 3)).ravel()
+        steps = np.round(values / (step or 1.0)).astype("<i2")
         data = steps.tobytes()
         if signs and not is_small:
             data = _pack_signs(steps)
         compressed = lzma.compress(data, lzma.FORMAT_ALONE)
         return cls(
-            numbers=len(moved) * square**2,
+            numbers=len(values) * square**2,
             step=step or 1.0,
             signs=not is_small and signs,
             square=square,
             offsets=base64.b85encode(compressed).decode("ascii"),
         )
 
-    def moved(self) -> Floats:
+    def dequantize(self) -> Floats:
         """Return the offsets, (n,) float32.
 
         Raises:
@@ -170,7 +170,7 @@ class _Block(BaseModel):
         """
         n_steps = self.numbers // self.square**2
         n_bytes = -(-n_steps // 3) if self.signs else 2 * n_steps
-        decompressor = lzma.LZMADecompressor(memlimit=MEMORY)
+        decompressor = lzma.LZMADecompressor(memlimit=MAX_MEMORY)
         # more than what is expected shows that it is another block
         max_bytes = 2 * n_steps + 1
         data = decompressor.decompress(base64.b85decode(self.offsets), max_bytes)
@@ -211,10 +211,10 @@ class _File(BaseModel):
     run: str
     said: str
     settings: dict[str, Any]
-    files: dict[str, str] = Field({}, max_length=FEW)
+    files: dict[str, str] = Field({}, max_length=MAX_FINE_VALUES)
     scene: str
     spp: int = Field(ge=1, le=65536)
-    blocks: list[_Block] = Field(min_length=1, max_length=FEW)
+    blocks: list[_Block] = Field(min_length=1, max_length=MAX_FINE_VALUES)
 
 
 @dataclass(frozen=True)
@@ -225,23 +225,23 @@ class Counterexample:
         name: name of the file.
         path: the file.
         config: settings that it was found with.
-        said: the wrong prediction.
+        wrong_label: the wrong prediction.
         files: SHA-256 of the files that its settings name, by name.
-        scene: digest of the scene.
+        scene_digest: digest of the scene.
         spp: samples per pixel that it was verified with.
-        moved: offset (d,) float32 of each value from the clean scene's.
+        clean_offsets: offset (d,) float32 of each value from the clean scene's.
     """
 
     name: str
     path: Path
     config: AttackConfig
-    said: str
+    wrong_label: str
     files: Mapping[str, str]
-    scene: str
+    scene_digest: str
     spp: int
-    moved: Floats
+    clean_offsets: Floats
 
-    def config_for(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
+    def make_config(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
         """Return the settings that test it: its own, with the suite's network and machine.
 
         Raises:
@@ -249,65 +249,71 @@ class Counterexample:
         """
         changed = {name: value for name, value in changes.items() if value is not None}
         merged = {**suite.settings, **changed}
-        network = {name: value for name, value in merged.items() if name in OF_MODEL}
-        replaced = (*OF_SUITE, *OF_MODEL)
+        network = {
+            name: value for name, value in merged.items() if name in MODEL_SETTINGS
+        }
+        replaced = (*SUITE_SETTINGS, *MODEL_SETTINGS)
         if "model" not in network:
             network = {}
-            replaced = OF_SUITE
+            replaced = SUITE_SETTINGS
         defaults = {
             setting.name: setting.default
             for setting in settings.settings(AttackConfig)
             if setting.name in replaced
         }
-        return AttackConfig(**{**self.config.plain(), **defaults, **network, **changed})
+        return AttackConfig(
+            **{**self.config.to_json(), **defaults, **network, **changed}
+        )
 
-    def changed_file(self, config: AttackConfig) -> str | None:
+    def find_changed_file(self, config: AttackConfig) -> str | None:
         """Return the name of a file in its settings that has changed, None if none has."""
-        return directory.summary.changed_file(self.files, deciding_settings(config))
+        return directory.summary.changed_file(
+            self.files, select_deciding_settings(config)
+        )
 
-    def configuration(self, start: Tensor) -> Tensor:
+    def make_configuration(self, start: Tensor) -> Tensor:
         """Return the configuration (d,) in [0, 1], from that of the clean scene.
 
         Raises:
             InputError: if the scene has another number of values by now.
         """
-        if start.numel() != len(self.moved):
+        if start.numel() != len(self.clean_offsets):
             raise InputError(
-                f"{self.path}: has {len(self.moved)} numbers, and its scene has "
+                f"{self.path}: has {len(self.clean_offsets)} numbers, and its scene has "
                 f"{start.numel()} now; remove it, or "
                 "add the adversarial scene of a new run"
             )
-        return (start + torch.from_numpy(self.moved)).clamp(0.0, 1.0)
+        return (start + torch.from_numpy(self.clean_offsets)).clamp(0.0, 1.0)
 
 
-def folder_of(suite: str) -> Path:
+def counterexample_directory(suite: str) -> Path:
     """Return the directory of a suite's counterexamples."""
     return Path(suite).with_suffix(".counterexamples")
 
 
-def scene_digest(described: SceneDescription) -> str:
+def compute_scene_digest(description: SceneDescription) -> str:
     """Return the SHA-256 of a scene's geometry, texture, light and values."""
     digest = hashlib.sha256()
-    mesh = described.object.mesh
-    light = described.environment
+    mesh = description.object.mesh
+    light = description.environment
     radiance = light.radiance if light else None
-    base_color = described.object.base_color
+    base_color = description.object.base_color
     for array in (mesh.vertices, mesh.faces, mesh.uvs, base_color, radiance):
         if array is not None:
             digest.update(np.ascontiguousarray(array).tobytes())
-    digest.update(json.dumps(sorted(described.given_values.items())).encode())
+    digest.update(json.dumps(sorted(description.requested_values.items())).encode())
     return digest.hexdigest()
 
 
-def deciding_settings(config: AttackConfig) -> dict[str, Any]:
+def select_deciding_settings(config: AttackConfig) -> dict[str, Any]:
     """Return the settings that decide a verdict, without the network, as JSON values."""
-    left_out = NOT_DECIDING | {*OF_MODEL}
+    left_out = NOT_DECIDING | {*MODEL_SETTINGS}
     return {
-        name: value for name, value in config.plain().items() if name not in left_out
+        name: value for name, value in config.to_json().items() if name not in left_out
     }
 
 
-def relative_to_here(values: Mapping[str, Any]) -> dict[str, Any]:
+def make_paths_relative(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings with files relative to the working directory, if they are in it.
 
     So a suite can be moved with its files.
@@ -323,7 +329,7 @@ def relative_to_here(values: Mapping[str, Any]) -> dict[str, Any]:
     return relative
 
 
-def outcome_of(
+def evaluate_trial(
     trial: tasks.Judgement, clean: tasks.Judgement | None = None
 ) -> bool | None:
     """Return whether the model is right in a trial, None if the trial does not count.
@@ -345,15 +351,15 @@ def decide_trials(right: int, wrong: int, *, over: bool) -> str:
     """
     total = right + wrong
     if not over:
-        if total < TRIALS[over] or (right and wrong):
+        if total < N_TRIALS[over] or (right and wrong):
             return UNDECIDED
         return HELD if right else FAILED
     if total:
         lower, _ = statistics.intervals.clopper_pearson(wrong, total)
-        if lower >= workbench.LEAST_RATE:
+        if lower >= workbench.MIN_RATE:
             return FAILED
     rule = workbench.OVER_CONDITIONS
-    if total >= rule.fewest and right >= rule.share(total):
+    if total >= rule.min_trials and right >= rule.count_percent(total):
         return HELD
     return UNDECIDED
 
@@ -363,16 +369,16 @@ def _is_wrong_on(
 ) -> bool:
     """Return whether the run's own model fails on the stored scene, with fresh seeds."""
     start = problem.domain.start
-    u = problem.domain.project(example.configuration(start))
+    u = problem.domain.project(example.make_configuration(start))
     outcomes = list[bool | None]()
     for index in range(trials):
         seed = seeds.stream(problem.seed, "kept", index)
         judgements = []
         for configuration in [u, start] if over else [u]:
             picture = problem.picture(configuration, seed, example.spp)
-            full = problem.whole(configuration, seed)
+            full = problem.add_conditions(configuration, seed)
             judgements.append(problem.judge(picture, full))
-        outcomes.append(outcome_of(*judgements))
+        outcomes.append(evaluate_trial(*judgements))
         if outcomes[-1] and not over:
             return False
     n_right = outcomes.count(True)
@@ -380,7 +386,7 @@ def _is_wrong_on(
     return decide_trials(n_right, n_wrong, over=over) == FAILED
 
 
-def add(suite: str, run: str) -> Counterexample:
+def add_counterexample(suite: str, run: str) -> Counterexample:
     """Store the adversarial scene of a run as a counterexample of a suite.
 
     It has the smallest form in which the run's own model still fails on it.
@@ -389,7 +395,7 @@ def add(suite: str, run: str) -> Counterexample:
         InputError: if the run found nothing, or its scene is no counterexample.
     """
     path = directory.find_run(run)
-    summary = workbench.attack_of(path)
+    summary = workbench.load_attack_summary(path)
     if summary.ending != "found" or summary.verified is None:
         raise InputError(
             f"add: expected a run that ended as 'found', got {path}, "
@@ -400,31 +406,33 @@ def add(suite: str, run: str) -> Counterexample:
             f"add: expected a run that makes the model wrong, got {path}, "
             "which makes the object easier"
         )
-    parts = workbench.parts_in(path)
-    problem, _ = workbench.problem_of_parts(parts)
-    configuration = workbench.kept_configuration(path, problem)
+    parts = workbench.load_parts_of_run(path)
+    problem, _ = workbench.make_problem_with_warnings(parts)
+    configuration = workbench.read_stored_configuration(path, problem)
     offsets = (configuration - problem.domain.start).numpy()
-    config = parts.config.to_repeat()
+    config = parts.config.make_repeatable()
     stored_settings = {
         name: value
-        for name, value in config.plain().items()
+        for name, value in config.to_json().items()
         if name not in NOT_DECIDING
     }
-    deciding = relative_to_here(deciding_settings(config))
+    deciding = make_paths_relative(select_deciding_settings(config))
     values: dict[str, Any] = {
         "schema": 1,
         "run": path.name,
         "said": next(iter(summary.verified.labels), ""),
-        "settings": relative_to_here(stored_settings),
+        "settings": make_paths_relative(stored_settings),
         "files": directory.summary.file_digests(deciding),
-        "scene": scene_digest(parts.scene.description),
+        "scene": compute_scene_digest(parts.scene.description),
         "spp": summary.verified.spp,
     }
-    base = folder_of(suite) / _name_counterexample(path)
+    base = counterexample_directory(suite) / _name_counterexample(path)
     base.parent.mkdir(parents=True, exist_ok=True)
     thumbnail = _make_thumbnail(path / "images" / "adversarial.png")
-    writing.write_bytes(base.with_name(f"{base.name}{PICTURE}"), thumbnail)
-    return _write_smallest(base, values, offsets, problem, over=is_over(config))
+    writing.write_bytes(base.with_name(f"{base.name}{PICTURE_SUFFIX}"), thumbnail)
+    return _write_smallest(
+        base, values, offsets, problem, over=varies_conditions(config)
+    )
 
 
 def _write_smallest(
@@ -446,11 +454,11 @@ def _write_smallest(
     """
     block_sizes = [block.size for block in problem.domain.blocks]
     blocks = np.split(offsets, np.cumsum(block_sizes)[:-1])
-    forms = FORMS if max(block_sizes) > FEW else FORMS[-1:]
+    forms = FORMS if max(block_sizes) > MAX_FINE_VALUES else FORMS[-1:]
     # one scene is tested twice as often as the suite will test it
-    trials = TRIALS[over] if over else 2 * TRIALS[over]
+    trials = N_TRIALS[over] if over else 2 * N_TRIALS[over]
     for form in forms:
-        stored = [_Block.of(block, *form).model_dump() for block in blocks]
+        stored = [_Block.quantize(block, *form).model_dump() for block in blocks]
         text = json.dumps({**values, "blocks": stored}, indent=1)
         path = writing.write_text(base.with_name(f"{base.name}.json"), text + "\n")
         example = _read(path)
@@ -493,17 +501,19 @@ def _make_thumbnail(path: Path) -> bytes:
     return buffer.getvalue()
 
 
-def remove(example: Counterexample) -> None:
+def delete_counterexample(example: Counterexample) -> None:
     """Delete the files of a counterexample."""
     example.path.unlink(missing_ok=True)
-    example.path.with_suffix(PICTURE).unlink(missing_ok=True)
+    example.path.with_suffix(PICTURE_SUFFIX).unlink(missing_ok=True)
 
 
-def counterexamples(suite: str) -> list[Counterexample]:
+def read_counterexamples(suite: str) -> list[Counterexample]:
     """Read the counterexamples of a suite, sorted by name."""
-    folder = folder_of(suite)
+    folder = counterexample_directory(suite)
     return [
-        _read(path) for path in sorted(folder.glob("*.json")) if path.name != EXPECTED
+        _read(path)
+        for path in sorted(folder.glob("*.json"))
+        if path.name != EXPECTED_FILE
     ]
 
 
@@ -514,9 +524,9 @@ def _read(path: Path) -> Counterexample:
         FileFormatError: if the file is none, or corrupt.
     """
     try:
-        text = stored_files.read_text(path, "a counterexample", LARGEST)
+        text = stored_files.read_text(path, "a counterexample", MAX_SIZE)
         content = _File.model_validate(stored_files.parse_json(text))
-        offsets = np.concatenate([block.moved() for block in content.blocks])
+        offsets = np.concatenate([block.dequantize() for block in content.blocks])
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         got = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
@@ -544,7 +554,7 @@ def _read(path: Path) -> Counterexample:
 
 
 # file of the accepted verdicts of claims that are not held
-EXPECTED = "expected.json"
+EXPECTED_FILE = "expected.json"
 
 
 def read_expected(suite: str) -> dict[str, str]:
@@ -553,11 +563,11 @@ def read_expected(suite: str) -> dict[str, str]:
     Raises:
         FileFormatError: if the file is corrupt.
     """
-    path = folder_of(suite) / EXPECTED
+    path = counterexample_directory(suite) / EXPECTED_FILE
     if not path.is_file():
         return {}
     try:
-        text = stored_files.read_text(path, "what is expected of a suite", LARGEST)
+        text = stored_files.read_text(path, "what is expected of a suite", MAX_SIZE)
         values = stored_files.parse_json(text)
     except (OSError, ValueError) as error:
         raise errors.FileFormatError(
@@ -579,7 +589,7 @@ def write_expected(suite: str, verdicts: Mapping[str, str]) -> list[str]:
     before = read_expected(suite)
     merged = sorted({**before, **verdicts}.items())
     stored = {name: verdict for name, verdict in merged if verdict != HELD}
-    path = folder_of(suite) / EXPECTED
+    path = counterexample_directory(suite) / EXPECTED_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"schema": 1, "expected": stored}, indent=1)
     writing.write_text(path, text + "\n")
@@ -591,6 +601,6 @@ def write_expected(suite: str, verdicts: Mapping[str, str]) -> list[str]:
     return changes
 
 
-def is_over(config: SceneConfig) -> bool:
+def varies_conditions(config: SceneConfig) -> bool:
     """Return whether settings vary conditions."""
     return bool(getattr(config, "over", {}))

@@ -16,7 +16,7 @@ SUITE_NOTE = "suite"
 SETTINGS_NOTE = "counterexamples"
 
 
-def noted_settings(
+def read_noted_settings(
     run: Path, result: SuiteResult
 ) -> dict[str, dict[str, Mapping[str, Any]]]:
     """Return the settings of each claim and counterexample that was tested.

@@ -40,7 +40,7 @@ UNDECIDED = "undecided"
 FAILED = "failed"
 VERDICTS = (HELD, UNDECIDED, FAILED)  # from the best to the worst
 # exit status of the command by the verdict of the suite
-STATUS = {HELD: 0, FAILED: 1, UNDECIDED: 2}
+EXIT_STATUS = {HELD: 0, FAILED: 1, UNDECIDED: 2}
 
 
 class Cause(str, Enum):
@@ -138,10 +138,10 @@ class SuiteResult(views.InNotebook, RunResult):
     @property
     def status(self) -> int:
         """The exit status of the command."""
-        return 0 if self.added is not None else STATUS[self.answer]
+        return 0 if self.added is not None else EXIT_STATUS[self.answer]
 
 
-def verdict(claims: list[ClaimResult]) -> str:
+def combine_verdicts(claims: list[ClaimResult]) -> str:
     """Return the worst verdict among claims that are worse than expected, else HELD."""
     return max(
         (claim.answer for claim in claims if not claim.accepted),
@@ -152,26 +152,26 @@ def verdict(claims: list[ClaimResult]) -> str:
 
 TABLE_HEADS = ("claim", "verdict", "pictures", "why")
 
-NOTE = (
+READING_NOTE = (
     "Held and failed are shown at the stated confidence, by one end of an interval, "
     "each of which holds however often "
     "it is looked at. A search that finds nothing is no proof."
 )
 
-TIME_OVER = "the time of the suite was over"
-STOPPED = "it was interrupted"
-NOT_TRIED = "not tried, since a counterexample failed"
-NOT_YET = "not tried yet"
+OUT_OF_TIME_REASON = "the time of the suite was over"
+INTERRUPTED_REASON = "it was interrupted"
+NOT_TESTED = "not tried, since a counterexample failed"
+NOT_TESTED_YET = "not tried yet"
 
 
-def shown(result: SuiteResult) -> ShownResult:
+def make_view(result: SuiteResult) -> ShownResult:
     """Lay out a result: a table of the claims, then each that is not held."""
     sections = [
         ResultPart(
             "The claims",
             heads=TABLE_HEADS,
-            rows=table_rows(result),
-            note=NOTE,
+            rows=make_table_rows(result),
+            note=READING_NOTE,
             parts=[claim.part for claim in result.claims],
         )
     ]
@@ -186,11 +186,11 @@ def shown(result: SuiteResult) -> ShownResult:
         sections.append(ResultPart(claim.name, rows=rows, pictures=pictures))
     sections.append(ResultPart("Expected from now on", result.changes))
     subject = [Path(result.suite).name, result.object, result.model]
-    summary = f"{result.title}. {suite_text(result)}"
-    return ShownResult(summary, sections, facts(result), subject)
+    summary = f"{result.title}. {describe_suite(result)}"
+    return ShownResult(summary, sections, list_facts(result), subject)
 
 
-def statement(claim: AnyClaim, config: SceneConfig) -> str:
+def describe_claim(claim: AnyClaim, config: SceneConfig) -> str:
     """Describe what is claimed in a sentence."""
     model = wording.short_name(config.model)
     what = f"{wording.short_name(config.object)}, {', '.join(config.controls)}"
@@ -227,8 +227,8 @@ def statement(claim: AnyClaim, config: SceneConfig) -> str:
     return f"no search finds a picture that {model} gets wrong: {what}{budget}"
 
 
-def share_reason(
-    what: str,
+def describe_fraction(
+    claimed: str,
     verdict: str,
     right: int,
     pictures: int,
@@ -239,7 +239,7 @@ def share_reason(
     """Describe why a claim about a fraction is held, failed or undecided.
 
     Args:
-        what: what is claimed of a picture.
+        claimed: what is claimed of a picture.
         verdict: HELD, FAILED or UNDECIDED.
         right: number of pictures of which it holds.
         pictures: number of all pictures.
@@ -250,7 +250,7 @@ def share_reason(
     reason = "no picture"
     if pictures:
         interval_text = wording.interval_text(interval)
-        reason = f"{what} in {right} of {pictures} (interval {interval_text})"
+        reason = f"{claimed} in {right} of {pictures} (interval {interval_text})"
     if outcomes:
         reason += f"; {outcomes}"
     if verdict == UNDECIDED:
@@ -260,8 +260,11 @@ def share_reason(
     return reason
 
 
-def difference_reason(
-    verdict: str, counts: tuple[int, int, int], interval: tuple[float, float], than: str
+def describe_difference(
+    verdict: str,
+    counts: tuple[int, int, int],
+    interval: tuple[float, float],
+    other_model: str,
 ) -> str:
     """Describe why a claim about two models is held, failed or undecided.
 
@@ -270,7 +273,7 @@ def difference_reason(
         counts: all pictures, those in which only the model under test is right, and
             those in which only the other one is.
         interval: interval of the difference of their fractions.
-        than: the other model.
+        other_model: the other model.
     """
     pictures, only_this, only_other = counts
     if not pictures:
@@ -279,7 +282,7 @@ def difference_reason(
     points = 100.0 * (only_this - only_other) / pictures
     reason = (
         f"of {wording.count(pictures, 'picture')} it alone is right in {only_this}, "
-        f"{wording.short_name(than)} alone in {only_other} "
+        f"{wording.short_name(other_model)} alone in {only_other} "
         f"(difference {points:+.1f} points, interval {bounds})"
     )
     if verdict == UNDECIDED:
@@ -287,7 +290,7 @@ def difference_reason(
     return reason
 
 
-def search_verdict(
+def evaluate_search(
     summary: workbench.AttackSummary, config: AttackConfig
 ) -> tuple[str, str, Cause | None]:
     """Return the verdict of a search, its reason, and the cause if it is not finished."""
@@ -295,7 +298,7 @@ def search_verdict(
     if summary.ending == "already wrong":
         return FAILED, _clean_reason(summary), None
     if summary.ending == "found" and verified is not None:
-        prediction = how_wrong(summary.task, verified)
+        prediction = describe_wrong_prediction(summary.task, verified)
         interval = wording.interval_text(verified.interval)
         wrong = (
             f"wrong in {verified.successes} of {verified.trials} trials (interval "
@@ -303,7 +306,7 @@ def search_verdict(
         )
         return FAILED, f"a verified counterexample: {wrong}{prediction}", None
     if summary.goes_on:
-        return UNDECIDED, STOPPED, Cause.INTERRUPTED
+        return UNDECIDED, INTERRUPTED_REASON, Cause.INTERRUPTED
     if verified is not None and verified.successes:
         reason = (
             f"what it found is wrong in {verified.successes} of {verified.trials} "
@@ -313,7 +316,7 @@ def search_verdict(
     max_steps = config.steps
     has_limit = config.seconds is not None
     if has_limit and max_steps is not None and summary.steps < max_steps:
-        reason = f"{TIME_OVER} after {summary.steps} of {max_steps} steps"
+        reason = f"{OUT_OF_TIME_REASON} after {summary.steps} of {max_steps} steps"
         return UNDECIDED, reason, Cause.OUT_OF_TIME
     baseline = "" if summary.baseline is None else ", nor by as many random renders"
     steps = wording.count(summary.steps, "step")
@@ -332,7 +335,7 @@ def _clean_reason(summary: workbench.AttackSummary) -> str:
     return reason
 
 
-def how_wrong(task: str, verified: results.VerifiedRate) -> str:
+def describe_wrong_prediction(task: str, verified: results.VerifiedRate) -> str:
     """Return the most frequent wrong prediction, as the end of a sentence."""
     label = next(iter(verified.labels), "")
     if verified.outcomes:
@@ -340,12 +343,12 @@ def how_wrong(task: str, verified: results.VerifiedRate) -> str:
     return f", most often {wording.with_article(label)}" if label else ""
 
 
-def cannot_be_judged(error: str) -> str:
+def describe_unsuitable(error: str) -> str:
     """Describe that a counterexample's settings do not suit the model."""
     return f"its own settings do not fit to this model: {error}"
 
 
-def tried_reason(
+def describe_trials(
     verdict: str,
     counts: tuple[int, int, int],
     label: str,
@@ -373,7 +376,9 @@ def tried_reason(
                 f"none of {uncounted} conditions counts: the clean scene is wrong, "
                 "or the object not to be seen"
             )
-        return "nothing of the object is to be seen" if uncounted else TIME_OVER
+        return (
+            "nothing of the object is to be seen" if uncounted else OUT_OF_TIME_REASON
+        )
     if not wrong:
         interval_text = wording.interval_text(interval)
         reason = f"right in {right} of {right} {trials} (interval {interval_text})"
@@ -395,7 +400,7 @@ def tried_reason(
     return reason
 
 
-def table_rows(result: SuiteResult) -> list[list[str]]:
+def make_table_rows(result: SuiteResult) -> list[list[str]]:
     """Return the rows of the table of claims."""
     rows = []
     for claim in result.claims:
@@ -409,7 +414,7 @@ def table_rows(result: SuiteResult) -> list[list[str]]:
     return rows
 
 
-def suite_text(result: SuiteResult) -> str:
+def describe_suite(result: SuiteResult) -> str:
     """Describe the result of a suite in a sentence."""
     if result.added is not None:
         return f"Kept as {result.added}."
@@ -423,7 +428,7 @@ def suite_text(result: SuiteResult) -> str:
     return f"{beginning}: {result.brief or 'no claims'}{expected}."
 
 
-def facts(result: SuiteResult) -> dict[str, str]:
+def list_facts(result: SuiteResult) -> dict[str, str]:
     """Return facts of a run of `test` by name."""
     return {
         "model": result.model,
@@ -435,7 +440,7 @@ def facts(result: SuiteResult) -> dict[str, str]:
     }
 
 
-def claims(result: SuiteResult) -> Iterator[views.Claim]:
+def list_claims(result: SuiteResult) -> Iterator[views.Claim]:
     """Yield what the result of each claim says, for `advsearch report`."""
     for tested in result.claims:
         text = (
@@ -458,7 +463,7 @@ def claims(result: SuiteResult) -> Iterator[views.Claim]:
 
 SARIF_SCHEMA = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json"
 
-MEANINGS = {
+KIND_DESCRIPTIONS = {
     "right": "The model is right in at least a share of the pictures that some "
     "controls span.",
     "not_broken": "No search finds a configuration within a budget that the model gets "
@@ -473,7 +478,7 @@ MEANINGS = {
 """What a claim of each kind states; the rules of SARIF."""
 
 
-def junit(result: SuiteResult) -> str:
+def format_junit(result: SuiteResult) -> str:
     """Return JUnit XML with a test case for each claim.
 
     Failed claims are failures, undecided ones are errors, and those that are so as
@@ -494,7 +499,7 @@ def junit(result: SuiteResult) -> str:
         root, "testsuite", {"name": _escape_xml(result.title), **attributes}
     )
     properties = ElementTree.SubElement(suite, "properties")
-    for name, value in {**facts(result), "run": result.run or ""}.items():
+    for name, value in {**list_facts(result), "run": result.run or ""}.items():
         ElementTree.SubElement(
             properties, "property", {"name": name, "value": _escape_xml(value)}
         )
@@ -533,7 +538,7 @@ def _add_test_case(
     outcome.text = _escape_xml("\n".join(filter(None, lines)))
 
 
-def sarif(result: SuiteResult) -> str:
+def format_sarif(result: SuiteResult) -> str:
     """Return SARIF 2.1.0 with a result for each claim that is not held.
 
     A rule is a kind of claims; locations are in the suite's file. What is so as
@@ -543,7 +548,7 @@ def sarif(result: SuiteResult) -> str:
     rules = [
         {
             "id": kind,
-            "shortDescription": {"text": MEANINGS[kind]},
+            "shortDescription": {"text": KIND_DESCRIPTIONS[kind]},
             "defaultConfiguration": {"level": "error"},
         }
         for kind in kinds
@@ -607,19 +612,20 @@ def _find_line(name: str, suite_lines: Sequence[str]) -> int:
     return 1
 
 
-def markdown(result: SuiteResult) -> str:
+def format_markdown(result: SuiteResult) -> str:
     """Return a Markdown table of the claims, and commands to repeat those not held."""
     fact_texts = [
-        f"{name} {_escape_markdown(value)}" for name, value in facts(result).items()
+        f"{name} {_escape_markdown(value)}"
+        for name, value in list_facts(result).items()
     ]
     lines = [
         f"### {_escape_markdown(result.title)}",
         "",
-        _escape_markdown(suite_text(result)),
+        _escape_markdown(describe_suite(result)),
         "",
         _format_row(TABLE_HEADS),
         _format_row(["---"] * len(TABLE_HEADS)),
-        *map(_format_row, table_rows(result)),
+        *map(_format_row, make_table_rows(result)),
         "",
         ", ".join(fact_texts),
     ]

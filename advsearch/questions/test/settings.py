@@ -97,23 +97,23 @@ class SuiteConfig(Config):
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
     # fmt: on
 
-    _named = settings.texts(
+    _named = settings.text_validator(
         "suite", "add", "model", "junit", "sarif", "markdown", "run", several=["only"]
     )
-    _different = settings.each_once("only")
+    _different = settings.unique_names_validator("only")
 
     @property
-    def chosen(self) -> tuple[str, ...]:
+    def selected_claims(self) -> tuple[str, ...]:
         """The names in `only`; empty for all claims."""
         return () if self.only is None else settings.split_names(self.only)
 
     @property
-    def title(self) -> tuple[str, ...]:
+    def title_words(self) -> tuple[str, ...]:
         """The names that a run's directory is named after."""
         return Path(self.suite).stem, self.command
 
 
-class DrawnConfig(SceneConfig):
+class SampledConfig(SceneConfig):
     """Settings of pictures that are sampled from the ranges of the controls."""
 
     command: ClassVar[str] = "test"
@@ -128,8 +128,8 @@ class DrawnConfig(SceneConfig):
     )
 
 
-OWN = (
-    *settings.PLACE,
+SUITE_ONLY_SETTINGS = (
+    *settings.RUN_LOCATION,
     "seed",
     "threads",
     "deterministic",
@@ -140,19 +140,19 @@ OWN = (
 """Settings that the suite or its command sets for all claims."""
 
 # default and limit of the pictures of a claim
-PICTURES = 400
-MOST = 1_000_000
+DEFAULT_PICTURES = 400
+MAX_PICTURES = 1_000_000
 # stands for all counterexamples; no claim may have this name
-COUNTEREXAMPLES = "counterexamples"
+ALL_COUNTEREXAMPLES = "counterexamples"
 Settings = dict[str, object]
 
-EXPECTED = {
+EXPECTED_VALUES = {
     "claim": "right, not_broken, no_worse, must_change or must_not_change",
     "claims": "names with a claim each, such as `right-around: {claim: right, "
     "at_least: 0.9}`",
     "at_least": "a share over 0 and under 1, such as 0.95",
     "points": "percentage points over 0 and under 100, such as 2",
-    "pictures": f"a whole number from 1 to {MOST}",
+    "pictures": f"a whole number from 1 to {MAX_PICTURES}",
     "when": (
         f"{', '.join(SweepConfig.blind_changes)} of must_change, and "
         f"{', '.join(SweepConfig.harmless_changes)} of "
@@ -166,32 +166,34 @@ EXPECTED = {
     "title": "a text of 1 to 200 letters",
 }
 
-A_CLAIM = "a claim such as {claim: right, at_least: 0.9}"
-NUMBERS = ("at_least", "points", "pictures", "confidence", "seconds", "seed")
+CLAIM_EXAMPLE = "a claim such as {claim: right, at_least: 0.9}"
+NUMBER_FIELDS = ("at_least", "points", "pictures", "confidence", "seconds", "seed")
 
 
-class _FromYaml(BaseModel):
+class _YamlModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
-    @field_validator(*NUMBERS, mode="before", check_fields=False)
+    @field_validator(*NUMBER_FIELDS, mode="before", check_fields=False)
     @classmethod
     def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
         """Reject true for a number: YAML's `pictures: yes` is a slip, not 1."""
         if isinstance(value, bool):
-            raise ValueError(f"expected {EXPECTED[info.field_name]}, got {value}")
+            raise ValueError(
+                f"expected {EXPECTED_VALUES[info.field_name]}, got {value}"
+            )
         return value
 
 
-class _Claim(_FromYaml):
-    kind: ClassVar[type[SceneConfig]]
+class _Claim(_YamlModel):
+    config_type: ClassVar[type[SceneConfig]]
     settings: Settings = Field(default_factory=dict)
 
 
 class _PicturesClaim(_Claim):
     """A claim that sampled pictures decide, `pictures` of them at most."""
 
-    kind: ClassVar[type[SceneConfig]] = DrawnConfig
-    pictures: Annotated[int, Field(ge=1, le=MOST)] = PICTURES
+    config_type: ClassVar[type[SceneConfig]] = SampledConfig
+    pictures: Annotated[int, Field(ge=1, le=MAX_PICTURES)] = DEFAULT_PICTURES
 
 
 class ShareClaim(_PicturesClaim):
@@ -242,7 +244,7 @@ class NotBrokenClaim(_Claim):
     Its settings are those of `attack`.
     """
 
-    kind: ClassVar[type[SceneConfig]] = AttackConfig
+    config_type: ClassVar[type[SceneConfig]] = AttackConfig
     claim: Literal["not_broken"]
 
 
@@ -261,10 +263,10 @@ ChangeClaim = MustChangeClaim | MustNotChangeClaim
 AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim | ChangeClaim
 """The kinds of claims; each is tested by a method of `Trial`."""
 
-KINDS = ("right", "not_broken", "no_worse", "must_change", "must_not_change")
+CLAIM_KINDS = ("right", "not_broken", "no_worse", "must_change", "must_not_change")
 
 
-class Suite(_FromYaml):
+class Suite(_YamlModel):
     """The content of a suite's file.
 
     Attributes:
@@ -292,14 +294,14 @@ class Suite(_FromYaml):
         """Check the names of claims."""
         for name in value:
             is_valid = re.fullmatch(r"[a-z0-9][a-z0-9-]{0,59}", name)
-            if not is_valid or name == COUNTEREXAMPLES:
+            if not is_valid or name == ALL_COUNTEREXAMPLES:
                 raise ValueError(
                     "expected names of small letters, digits and "
-                    f"hyphens, got {settings.shown(name)}"
+                    f"hyphens, got {settings.format_value(name)}"
                 )
         return value
 
-    def config_of(self, name: str, **changes: object) -> SceneConfig:
+    def make_config(self, name: str, **changes: object) -> SceneConfig:
         """Return the settings that a claim is tested with.
 
         Args:
@@ -316,14 +318,14 @@ class Suite(_FromYaml):
             (f"claims.{name}.settings", claim.settings),
         ):
             for known in claim_settings:
-                if known in OWN:
+                if known in SUITE_ONLY_SETTINGS:
                     raise InputError(
                         f"{where}: {known} is said for the whole suite; leave it out there"
                     )
         changed = {key: value for key, value in changes.items() if value is not None}
         merged = {**self.settings, **claim.settings, "seed": self.seed, **changed}
         try:
-            return claim.kind(**merged)
+            return claim.config_type(**merged)
         except InputError as error:
             raise InputError(f"claims.{name}: {error}") from None
 
@@ -334,10 +336,10 @@ def read_suite(path: str | Path) -> Suite:
     Raises:
         FileFormatError: if the file describes none.
     """
-    return suite_of(settings.read_yaml(path), str(path))
+    return parse_suite(settings.read_yaml(path), str(path))
 
 
-def suite_of(data: Mapping[str, object], where: str) -> Suite:
+def parse_suite(data: Mapping[str, object], where: str) -> Suite:
     """Parse the content of a suite's file; `where` names the file in messages.
 
     Raises:
@@ -359,8 +361,8 @@ def suite_of(data: Mapping[str, object], where: str) -> Suite:
 def _describe_error(error: Any) -> str:
     """Describe a problem that pydantic found, with what was expected."""
     kind = error["type"]
-    location = [str(part) for part in error["loc"] if part not in KINDS]
-    got = settings.shown(error["input"])
+    location = [str(part) for part in error["loc"] if part not in CLAIM_KINDS]
+    got = settings.format_value(error["input"])
     if location[-1] == "[key]":  # a name that is a number
         return (
             f"{location[0]}: expected names of small letters, digits and hyphens, got "
@@ -370,7 +372,7 @@ def _describe_error(error: Any) -> str:
         location.append("claim")
         got = "nothing"
         if kind != "union_tag_not_found":
-            got = settings.shown(error["ctx"]["tag"])
+            got = settings.format_value(error["ctx"]["tag"])
     where = ".".join(location)
     name = location[-1]
     if kind == "extra_forbidden":
@@ -378,15 +380,15 @@ def _describe_error(error: Any) -> str:
     if kind == "value_error":
         return f"{where}: {str(error['msg']).removeprefix('Value error, ')}"
     got = {"missing": "nothing", "too_short": "none"}.get(kind, got)
-    return f"{where}: expected {EXPECTED.get(name, A_CLAIM)}, got {got}"
+    return f"{where}: expected {EXPECTED_VALUES.get(name, CLAIM_EXAMPLE)}, got {got}"
 
 
 def _describe_unknown_name(name: str, *, in_claim: bool) -> str:
     """Describe a name that a suite or a claim does not have."""
-    if name in EXPECTED:
+    if name in EXPECTED_VALUES:
         owner = "a claim of this kind" if in_claim else "a suite"
         return f"{owner} has no {name}; leave it out"
-    similar = difflib.get_close_matches(name, sorted(EXPECTED), 1)
+    similar = difflib.get_close_matches(name, sorted(EXPECTED_VALUES), 1)
     guess = "docs/testing.md has the names"
     if similar:
         guess = f"did you mean {similar[0]}?"

@@ -14,9 +14,9 @@ from pathlib import Path
 from advsearch.extend import errors, reading, stored_files
 
 LONGEST = 120  # timeout of Blender in seconds, before `scaled`
-BEGINNINGS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
+MAGIC_BYTES = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
 """First bytes of a .blend file: uncompressed, zstd, or gzip (before Blender 3.0)."""
-EXPORT = """
+EXPORT_SCRIPT = """
 import sys
 source, target, most = sys.argv[-3:]
 try:
@@ -43,8 +43,8 @@ def convert_blend(path: Path, data: bytes) -> bytes:
         FileFormatError: it is no Blender file, Blender is not installed, cannot read it,
             or takes too long.
     """
-    if not data.startswith(BEGINNINGS):
-        raise reading.damaged(path, "a Blender scene", reading.looks_like(data))
+    if not data.startswith(MAGIC_BYTES):
+        raise reading.damaged(path, "a Blender scene", reading.describe_content(data))
     program = reading.find_blender(
         f"{path}: Blender has to read it",
         "export glTF (.glb) from Blender and name that",
@@ -52,7 +52,7 @@ def convert_blend(path: Path, data: bytes) -> bytes:
     with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
         script = Path(folder) / "export.py"
         target = Path(folder) / "scene.glb"
-        script.write_text(EXPORT, "utf-8")
+        script.write_text(EXPORT_SCRIPT, "utf-8")
         arguments = [
             str(path.resolve()),
             str(target),

@@ -22,31 +22,31 @@ from advsearch.trust.stored_files import LARGEST_FILE, check_most
 
 # ---- Formats of objects and cameras that are not read, and how to convert them ----
 
-BLENDER_READS = {
+BLENDER_IMPORTERS = {
     "an FBX model": ("bpy.ops.import_scene.fbx", (".fbx",)),
     "an Alembic scene": ("bpy.ops.wm.alembic_import", (".abc",)),
 }
-SPLATS = (
+SPLATS_ADVICE = (
     "has no surface; train one that yields a mesh (2D Gaussian Splatting's render.py "
     "writes fuse_post.ply), name that"
 )
-POINTS = (
+POINT_CLOUD_ADVICE = (
     "has no surface; make one (in Python "
     "open3d.geometry.TriangleMesh.create_from_point_cloud_poisson), name its .ply"
 )
-UNPACK = "unpack it, and name the mesh in it"
-ELSEWHERE = "open it in that program and export glTF (.glb)"
-ASSIMP = (
+UNPACK_ADVICE = "unpack it, and name the mesh in it"
+EXPORT_ADVICE = "open it in that program and export glTF (.glb)"
+ASSIMP_ADVICE = (
     "make an .obj of it, with assimp (Open Asset Import Library): assimp export "
     "{file} {obj}"
 )
-SAID = {
-    "a COLLADA model": (ASSIMP, (".dae", ".zae")),
-    "a 3MF model": (ASSIMP, (".3mf",)),
-    "a 3D Studio model": (ASSIMP, (".3ds",)),
-    "an OFF mesh": (ASSIMP, (".off",)),
-    "an X3D or VRML scene": (ASSIMP, (".x3d", ".wrl")),
-    "a LightWave model": (ASSIMP, (".lwo",)),
+FORMAT_ADVICE = {
+    "a COLLADA model": (ASSIMP_ADVICE, (".dae", ".zae")),
+    "a 3MF model": (ASSIMP_ADVICE, (".3mf",)),
+    "a 3D Studio model": (ASSIMP_ADVICE, (".3ds",)),
+    "an OFF mesh": (ASSIMP_ADVICE, (".off",)),
+    "an X3D or VRML scene": (ASSIMP_ADVICE, (".x3d", ".wrl")),
+    "a LightWave model": (ASSIMP_ADVICE, (".lwo",)),
     "a CAD model without triangles": (
         "mesh it, with Gmsh: gmsh {file} -2 -o {stl}",
         (".step", ".stp", ".iges", ".igs", ".brep"),
@@ -56,13 +56,22 @@ SAID = {
         "take its glTF out: npx 3d-tiles-tools b3dmToGlb -i {file} -o {glb}",
         (".b3dm",),
     ),
-    "a model of Gaussian splats": (SPLATS, (".splat", ".ksplat", ".spz", ".sog")),
-    "a cloud of points": (POINTS, (".las", ".laz", ".pcd", ".e57", ".xyz", ".pts")),
-    "an archive": (UNPACK, (".zip", ".gz", ".7z", ".rar", ".tar", ".tgz", ".gltfz")),
-    "a file of Maya's": (ELSEWHERE, (".ma", ".mb")),
-    "a file of 3ds Max's": (ELSEWHERE, (".max",)),
-    "a file of Cinema 4D's": (ELSEWHERE, (".c4d",)),
-    "a file of SketchUp's": (ELSEWHERE, (".skp",)),
+    "a model of Gaussian splats": (
+        SPLATS_ADVICE,
+        (".splat", ".ksplat", ".spz", ".sog"),
+    ),
+    "a cloud of points": (
+        POINT_CLOUD_ADVICE,
+        (".las", ".laz", ".pcd", ".e57", ".xyz", ".pts"),
+    ),
+    "an archive": (
+        UNPACK_ADVICE,
+        (".zip", ".gz", ".7z", ".rar", ".tar", ".tgz", ".gltfz"),
+    ),
+    "a file of Maya's": (EXPORT_ADVICE, (".ma", ".mb")),
+    "a file of 3ds Max's": (EXPORT_ADVICE, (".max",)),
+    "a file of Cinema 4D's": (EXPORT_ADVICE, (".c4d",)),
+    "a file of SketchUp's": (EXPORT_ADVICE, (".skp",)),
     "NumPy's arrays": (
         "write the mesh, as in trimesh.Trimesh(vertices, faces).export('mesh.ply')",
         (".npz", ".npy"),
@@ -72,7 +81,7 @@ SAID = {
         (".png", ".jpg", ".jpeg", ".webp", ".hdr", ".exr"),
     ),
 }
-CAMERAS = {
+CAMERA_FORMAT_ADVICE = {
     ".bin": "COLMAP's binary cameras: write them as text, colmap model_converter "
     "--input_path FOLDER --output_path "
     "FOLDER --output_type TXT, and give cameras.txt",
@@ -80,21 +89,23 @@ CAMERAS = {
     "camera_matrix and "
     "distortion_coefficients (numpy.ndarray.tolist)",
 }
-CAMERAS |= {
-    ".npy": CAMERAS[".npz"],
-    ".pkl": CAMERAS[".npz"].replace("NumPy's arrays", "a pickle, which may run code"),
+CAMERA_FORMAT_ADVICE |= {
+    ".npy": CAMERA_FORMAT_ADVICE[".npz"],
+    ".pkl": CAMERA_FORMAT_ADVICE[".npz"].replace(
+        "NumPy's arrays", "a pickle, which may run code"
+    ),
 }
 """Advice on formats of cameras that are not read."""
 
 
-def advice(path: Path) -> str | None:
+def find_advice(path: Path) -> str | None:
     """Return what a file is by its suffix and how to convert it; None if unknown.
 
     It completes a sentence: ``"an FBX model: make glTF of it, with Blender: blender -b
     ..."``.
     """
     suffix = path.suffix.lower()
-    for kind, (operator, blender_suffixes) in BLENDER_READS.items():
+    for kind, (operator, blender_suffixes) in BLENDER_IMPORTERS.items():
         if suffix in blender_suffixes:
             return f"{kind}: {_blender_advice(path, operator)}"
     if suffix == ".bin":
@@ -106,7 +117,7 @@ def advice(path: Path) -> str | None:
     targets = {
         name: shlex.quote(f"{path.stem}.{name}") for name in ("obj", "stl", "glb")
     }
-    for kind, (instructions, suffixes) in SAID.items():
+    for kind, (instructions, suffixes) in FORMAT_ADVICE.items():
         if suffix in suffixes:
             text = instructions.format(file=shlex.quote(path.name), **targets)
             return f"{kind}: {text}"
@@ -126,8 +137,8 @@ def _blender_advice(path: Path, operator: str) -> str:
     )
 
 
-_LONGEST_NAME = 100
-_KINDS = (
+_MAX_NAME_LENGTH = 100
+_MAGIC_BYTES = (
     (b"\x89PNG", "a PNG picture"),
     (b"\xff\xd8\xff", "a JPEG picture"),
     (b"GIF8", "a GIF picture"),
@@ -198,11 +209,11 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
     if part and Path(file).suffix.lower() in suffixes:
         raise FileFormatError(
             f"{file}: has no parts by name, got "
-            f"#{shown(part, quoted=False)}; leave it out"
+            f"#{format_name(part, quoted=False)}; leave it out"
         )
     conversion = None
     if what != "environment":
-        conversion = advice(Path(file) if file else path)
+        conversion = find_advice(Path(file) if file else path)
     if conversion is not None:
         raise FileFormatError(f"{path}: {conversion} (read are {either(suffixes)})")
     got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
@@ -242,13 +253,13 @@ def damaged(path: Path | str, expected: str, got: str) -> FileFormatError:
 
 def find_kind(data: bytes) -> str | None:
     """Return the kind of file that begins with some bytes, to follow "got", or None."""
-    for magic, kind in _KINDS:
+    for magic, kind in _MAGIC_BYTES:
         if data.startswith(magic):
             return kind
     return None
 
 
-def looks_like(data: bytes) -> str:
+def describe_content(data: bytes) -> str:
     """Describe the content of a file, to follow "got" in a message."""
     kind = find_kind(data)
     if kind is not None:
@@ -256,7 +267,7 @@ def looks_like(data: bytes) -> str:
     return "binary data of another kind" if b"\x00" in data else "text of another kind"
 
 
-def text_of(data: bytes) -> str:
+def decode_text(data: bytes) -> str:
     """Decode UTF-8 or, failing that, Latin-1; a byte order mark is dropped."""
     try:
         return data.decode("utf-8-sig")
@@ -264,7 +275,7 @@ def text_of(data: bytes) -> str:
         return data.decode("latin-1")
 
 
-def numbers_in(data: bytes, kind: type) -> npt.NDArray[np.generic]:
+def parse_number_array(data: bytes, kind: type) -> npt.NDArray[np.generic]:
     """Parse numbers (N,) separated by blanks, up to the first word that is none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -283,18 +294,20 @@ def is_number(word: str) -> bool:
     return "_" not in word  # Python's own notation
 
 
-def shown(name: str, *, quoted: bool = True, longest: int = _LONGEST_NAME) -> str:
+def format_name(
+    name: str, *, quoted: bool = True, max_length: int = _MAX_NAME_LENGTH
+) -> str:
     """Format a name out of a file for a message.
 
-    Control characters are escaped, and a name that is longer than `longest` is cut to
+    Control characters are escaped, and a name that is longer than `max_length` is cut to
     half of that.
     """
-    cut = name if len(name) <= longest else name[: longest // 2]
+    cut = name if len(name) <= max_length else name[: max_length // 2]
     text = repr(cut) if quoted else repr(cut)[1:-1]
     return text if cut == name else f"{text}... ({len(name):,} characters)"
 
 
-def safe_name(path: Path) -> str:
+def make_safe_name(path: Path) -> str:
     """Return a file's name without suffix and without special characters.
 
     Everything but letters, digits, '.', '_' and '-' becomes a '-'.
@@ -302,34 +315,34 @@ def safe_name(path: Path) -> str:
     return re.sub(r"[^A-Za-z0-9._-]", "-", path.stem).strip(".-") or "imported"
 
 
-class Names:
+class UniqueNames:
     """Makes names unique, and valid in a setting; names in `taken` are not given out."""
 
-    def __init__(self, taken: Iterable[str] = ()) -> None:
-        self._taken = set(taken)
+    def __init__(self, reserved: Iterable[str] = ()) -> None:
+        self._used = set(reserved)
         self._last: dict[str, int] = {}
 
-    def free(self, wanted: str) -> str:
+    def make_unique(self, requested: str) -> str:
         """Return a name, with the first free number behind it if it is used already."""
-        base = clean(wanted)
+        base = sanitize_name(requested)
         name = base
         number = self._last.get(base, 1)
-        while name in self._taken:
+        while name in self._used:
             number += 1
             name = f"{base}-{number}"
         self._last[base] = number
-        self._taken.add(name)
+        self._used.add(name)
         return name
 
 
-def clean(name: str) -> str:
+def sanitize_name(name: str) -> str:
     """Return a name reduced to letters, digits, dashes and underscores, 60 at most."""
     return re.sub(r"[^\w-]+", "-", name).strip("-")[:60] or "part"
 
 
 LARGEST_FACES = 2_000_000
 """Limit of the triangles of a mesh, before `scaled`; each takes over 1 KB of memory."""
-MOST_CORNERS = 10_000  # limit of the corners of a face
+MAX_CORNERS = 10_000  # limit of the corners of a face
 
 
 def check_faces(path: Path | str, count: int, got: str | None = None) -> None:
@@ -354,22 +367,22 @@ class Notes:
         self.path = path
         self.source = path.name if isinstance(path, Path) else path
         # A dict for speed, since a file may cause 100,000 warnings.
-        self._said: dict[str, None] = {}
-        self._has: Counter[tuple[str, str]] = Counter()
-        self._taken: set[tuple[str, str]] = set()
+        self._warnings: dict[str, None] = {}
+        self._recorded: Counter[tuple[str, str]] = Counter()
+        self._read: set[tuple[str, str]] = set()
 
-    def say(self, clause: str) -> None:
+    def warn(self, clause: str) -> None:
         """Add a warning, if it is new.
 
         The name of the file precedes the clause, with a colon unless the clause begins
         with a blank.
         """
         separator = "" if clause.startswith(" ") else ": "
-        self._said[f"{self.source}{separator}{clause}"] = None
+        self._warnings[f"{self.source}{separator}{clause}"] = None
 
     def damaged(self, expected: str, got: str | bytes) -> FileFormatError:
         """Return the error of `damaged`; content, as bytes, is described."""
-        text = got if isinstance(got, str) else looks_like(got)
+        text = got if isinstance(got, str) else describe_content(got)
         return damaged(self.path, expected, text)
 
     def check_most(self, count: int, limit: int, expected: str) -> None:
@@ -380,24 +393,24 @@ class Notes:
         """Check the number of triangles of the file; see `check_faces`."""
         check_faces(self.path, count)
 
-    def has(self, kind: str, name: str) -> None:
+    def record(self, kind: str, name: str) -> None:
         """Record that the file has something."""
-        self._has[kind, name] += 1
+        self._recorded[kind, name] += 1
 
-    def take(self, kind: str, name: str) -> None:
+    def mark_read(self, kind: str, name: str) -> None:
         """Record that something is read; the file need not have it."""
-        self._taken.add((kind, name))
+        self._read.add((kind, name))
 
     def __iter__(self) -> Iterator[str]:
         """Yield all warnings, then what the file has and was not read."""
-        yield from self._said
-        for (kind, name), count in self._has.items():
-            if (kind, name) not in self._taken:
+        yield from self._warnings
+        for (kind, name), count in self._recorded.items():
+            if (kind, name) not in self._read:
                 times = "" if count == 1 else f" ({count:,} times)"
-                yield f"{self.source}: {kind} {shown(name)}{times} is left out"
+                yield f"{self.source}: {kind} {format_name(name)}{times} is left out"
 
 
-def last_line(said: str) -> str:
+def last_line(output: str) -> str:
     """Return the last line of a program's output after a colon, "" if there is none."""
-    lines = [line for line in said.splitlines() if line.strip()]
-    return f": {shown(lines[-1].strip(), quoted=False)}" if lines else ""
+    lines = [line for line in output.splitlines() if line.strip()]
+    return f": {format_name(lines[-1].strip(), quoted=False)}" if lines else ""

@@ -13,21 +13,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Bools, Doubles, Ints, Mesh, face_vectors
+from advsearch.scene.assets import (
+    BoolArray,
+    Float64Array,
+    IntArray,
+    Mesh,
+    compute_area_vectors,
+)
 from advsearch.scene.importing.files import Notes
 from advsearch.scene.importing.parts import ImportedPart
 
-WELD = 1e-6
+WELD_DISTANCE = 1e-6
 """Points closer than this fraction of the largest extent are one point; text and 32-bit
 files round to about that.
 """
 # Twice the area, in squared extents, up to which a face counts as having none.
-FLAT = 1e-12
+MIN_DOUBLED_AREA = 1e-12
 CREASE_DEGREES = 40.0
 """Where the normals of two neighbouring faces differ by more, a computed normal is not
 smoothed across their edge.
 """
-TRUSTED = 0.98
+MIN_NORMAL_AGREEMENT = 0.98
 """Fraction of the surface on which a file's normals must agree with the faces for the
 normals to be used.
 """
@@ -37,33 +43,33 @@ normals to be used.
 class Soup:
     """Triangles with welded points and per-corner attributes."""
 
-    points: Doubles  # (P, 3), the largest extent 1
-    faces: Ints  # (F, 3) points
-    part: Ints  # (F,) the part of the file that the face belongs to
-    normals: Doubles  # (F, 3, 3) unit normals of the corners; NaN if unknown
-    uvs: Doubles  # (F, 3, 2); NaN if unknown
+    points: Float64Array  # (P, 3), the largest extent 1
+    faces: IntArray  # (F, 3) points
+    part: IntArray  # (F,) the part of the file that the face belongs to
+    normals: Float64Array  # (F, 3, 3) unit normals of the corners; NaN if unknown
+    uvs: Float64Array  # (F, 3, 2); NaN if unknown
     # (F, 3, 3) linear factors of the base color; 1 if the file has none.
-    colors: Doubles
+    colors: Float64Array
     # (F,) whether a face is shaded flat if it has no normals; None: none is.
-    flat: Bools | None = None
+    flat: BoolArray | None = None
     # (F, 3) for each corner its vertex in the concatenated parts; None if unknown.
-    stored: Ints | None = None
+    stored: IntArray | None = None
 
-    def only(self, keep: Bools) -> Soup:
+    def select_faces(self, mask: BoolArray) -> Soup:
         """Return the soup with the faces selected by a mask (F,)."""
         selected = {
-            name: values[keep]
+            name: values[mask]
             for name, values in vars(self).items()
             if name != "points" and values is not None
         }
         return replace(self, **selected)
 
-    def reversed(self, turn: Bools) -> Soup:
+    def flip_faces(self, mask: BoolArray) -> Soup:
         """Return the soup with the faces of a mask (F,) wound the other way.
 
         Normals stay as they are.
         """
-        order = np.where(turn[:, None], [0, 2, 1], [0, 1, 2])
+        order = np.where(mask[:, None], [0, 2, 1], [0, 1, 2])
         rows = np.arange(len(order))[:, None]
         names = ["faces", "normals", "uvs", "colors"]
         if self.stored is not None:
@@ -72,12 +78,12 @@ class Soup:
             self, **{name: getattr(self, name)[rows, order] for name in names}
         )
 
-    def face_vectors(self) -> Doubles:
+    def face_vectors(self) -> Float64Array:
         """Return face normals (F, 3), as long as twice the faces' areas."""
-        return face_vectors(self.points[self.faces])
+        return compute_area_vectors(self.points[self.faces])
 
 
-def compute_turn(up: str, front: str) -> Doubles:
+def compute_rotation(up: str, front: str) -> Float64Array:
     """Return the rotation (3, 3) from a file's axes to ours (front +x, up +z).
 
     `up` is "y" or "z", `front` one of `FACINGS` along another axis.
@@ -90,7 +96,7 @@ def compute_turn(up: str, front: str) -> Doubles:
     return np.stack([front_axis, side_axis, up_axis]) + 0.0
 
 
-def join(parts: Sequence[ImportedPart], source: str, turn: Doubles) -> Soup:
+def join_parts(parts: Sequence[ImportedPart], source: str, turn: Float64Array) -> Soup:
     """Join parts into one soup of unit extent with welded points.
 
     Args:
@@ -108,7 +114,7 @@ def join(parts: Sequence[ImportedPart], source: str, turn: Doubles) -> Soup:
         [part.faces + start for part, start in zip(parts, starts[:-1], strict=True)]
     )
     low = vertices[np.unique(faces)].min(axis=0)
-    size = extent_of(parts)
+    size = compute_extent(parts)
     if not 0.0 < size < np.inf:
         problem = "its extent is too large to compute with"
         if size == 0.0:
@@ -119,7 +125,9 @@ def join(parts: Sequence[ImportedPart], source: str, turn: Doubles) -> Soup:
         )
     points, index = _weld((vertices - low) / size @ turn.T + 0.0)
     n_faces = [len(part.faces) for part in parts]
-    normals = np.concatenate([_corners(part.normals, part.faces, 3) for part in parts])
+    normals = np.concatenate(
+        [_gather_at_corners(part.normals, part.faces, 3) for part in parts]
+    )
     colors = [
         np.ones((len(part.faces), 3, 3)) if part.colors is None else part.colors
         for part in parts
@@ -129,15 +137,17 @@ def join(parts: Sequence[ImportedPart], source: str, turn: Doubles) -> Soup:
         points=points,
         faces=index[faces],
         part=np.arange(len(parts)).repeat(n_faces),
-        normals=unit_vectors(normals) @ turn.T,
-        uvs=np.concatenate([_corners(part.uvs, part.faces, 2) for part in parts]),
+        normals=normalize_vectors(normals) @ turn.T,
+        uvs=np.concatenate(
+            [_gather_at_corners(part.uvs, part.faces, 2) for part in parts]
+        ),
         colors=np.concatenate(colors),
         flat=np.array([part.flat for part in parts]).repeat(n_faces),
         stored=faces if has_movable else None,
     )
 
 
-def _check_finite(vertices: Doubles, source: str) -> None:
+def _check_finite(vertices: Float64Array, source: str) -> None:
     is_bad = ~np.isfinite(vertices).all(axis=1)
     if is_bad.any():
         first = int(is_bad.argmax())
@@ -149,8 +159,8 @@ def _check_finite(vertices: Doubles, source: str) -> None:
         )
 
 
-def _weld(vertices: Doubles) -> tuple[Doubles, Ints]:
-    """Merge vertices (V, 3) that are closer than `WELD`.
+def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
+    """Merge vertices (V, 3) that are closer than `WELD_DISTANCE`.
 
     Returns:
         The points (P, 3), and the point of each vertex (V,).
@@ -160,9 +170,9 @@ def _weld(vertices: Doubles) -> tuple[Doubles, Ints]:
 
     points, index = np.unique(vertices, axis=0, return_inverse=True)
     index = index.reshape(-1)
-    pairs = cKDTree(points).query_pairs(WELD, output_type="ndarray")
+    pairs = cKDTree(points).query_pairs(WELD_DISTANCE, output_type="ndarray")
     if len(pairs):
-        cluster = connected(len(points), pairs[:, 0], pairs[:, 1])
+        cluster = find_components(len(points), pairs[:, 0], pairs[:, 1])
         _, first_of_cluster, cluster_of_point = np.unique(
             cluster, return_index=True, return_inverse=True
         )
@@ -171,7 +181,7 @@ def _weld(vertices: Doubles) -> tuple[Doubles, Ints]:
     return points, index
 
 
-def extent_of(parts: Sequence[ImportedPart]) -> float:
+def compute_extent(parts: Sequence[ImportedPart]) -> float:
     """Return the largest extent of all faces along an axis, in the file's unit.
 
     It is infinite beyond float64.
@@ -182,8 +192,8 @@ def extent_of(parts: Sequence[ImportedPart]) -> float:
     return float((high / 2 - low / 2).max()) * 2
 
 
-def repaired(soup: Soup, source: str, notes: Notes) -> Soup:
-    """Repair a soup that `join` returned.
+def repair(soup: Soup, source: str, notes: Notes) -> Soup:
+    """Repair a soup that `join_parts` returned.
 
     Faces without area are removed, the winding becomes consistent and outward, and
     every normal has unit length and is on the front of its face.
@@ -191,19 +201,19 @@ def repaired(soup: Soup, source: str, notes: Notes) -> Soup:
     Raises:
         InputError: no face has an area; the message names the file, `source`.
     """
-    has_no_area = np.linalg.norm(soup.face_vectors(), axis=1) <= FLAT
+    has_no_area = np.linalg.norm(soup.face_vectors(), axis=1) <= MIN_DOUBLED_AREA
     if has_no_area.all():
         raise InputError(
             f"{source}: expected faces with an area, got {len(has_no_area)} "
             "without; export it again"
         )
     if has_no_area.any():
-        notes.say(f"{int(has_no_area.sum())} faces without area were removed")
-        soup = soup.only(~has_no_area)
-    return _shaded(_wound(soup, notes), notes)
+        notes.warn(f"{int(has_no_area.sum())} faces without area were removed")
+        soup = soup.select_faces(~has_no_area)
+    return _fix_normals(_fix_winding(soup, notes), notes)
 
 
-def assemble(soup: Soup) -> tuple[Mesh, Ints | None]:
+def assemble(soup: Soup) -> tuple[Mesh, IntArray | None]:
     """Return the soup as a mesh, and the stored vertex of each of its vertices.
 
     Corners with the same point, normal and UV, and the same stored vertex if that is
@@ -230,29 +240,29 @@ def assemble(soup: Soup) -> tuple[Mesh, Ints | None]:
 # ---- Winding ----
 
 
-def _wound(soup: Soup, notes: Notes) -> Soup:
+def _fix_winding(soup: Soup, notes: Notes) -> Soup:
     """Return the soup with consistent and outward winding, and note the changes."""
-    is_turned, shell, has_moebius_strip = _agreement(soup)
+    is_turned, shell, has_moebius_strip = _find_turned_faces(soup)
     if is_turned.any():
-        notes.say(
+        notes.warn(
             f"{int(is_turned.sum())} faces wound against their neighbours were turned "
             "over"
         )
     if has_moebius_strip:
-        notes.say(
+        notes.warn(
             "has a one-sided surface (a Moebius strip), so some faces show their backs"
         )
-    soup = soup.reversed(is_turned)
-    is_inside_out = _inside_out(soup, shell)[shell]
+    soup = soup.flip_faces(is_turned)
+    is_inside_out = _find_inside_out_shells(soup, shell)[shell]
     if is_inside_out.any():
-        notes.say(
+        notes.warn(
             f"{int(is_inside_out.sum())} faces were inside out and have been turned "
             "over"
         )
-    return soup.reversed(is_inside_out)
+    return soup.flip_faces(is_inside_out)
 
 
-def neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
+def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """Find the edges that belong to exactly two faces (F, 3).
 
     Returns:
@@ -276,7 +286,7 @@ def neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
     return left, right, start[left] == start[right]
 
 
-def _agreement(soup: Soup) -> tuple[Bools, Ints, bool]:
+def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
     """Decide which faces to turn over so that neighbours agree in winding.
 
     Every face is two nodes of a graph, "as it is" and "turned". Neighbours that agree
@@ -287,7 +297,7 @@ def _agreement(soup: Soup) -> tuple[Bools, Ints, bool]:
         Which faces (F,) to turn over; the shell of each face (F,); and whether some
         shell is one-sided.
     """
-    left, right, same_direction = neighbours(soup.faces)
+    left, right, same_direction = find_shared_edges(soup.faces)
     area = np.linalg.norm(soup.face_vectors(), axis=1)
     left_face = left // 3
     right_face = right // 3
@@ -295,7 +305,7 @@ def _agreement(soup: Soup) -> tuple[Bools, Ints, bool]:
     ends = np.concatenate(
         [2 * right_face + same_direction, 2 * right_face + 1 - same_direction]
     )
-    component = connected(2 * len(area), starts, ends)
+    component = find_components(2 * len(area), starts, ends)
     as_is = component[0::2]
     turned = component[1::2]
     votes = np.bincount(as_is, weights=area, minlength=int(component.max()) + 1)
@@ -306,7 +316,7 @@ def _agreement(soup: Soup) -> tuple[Bools, Ints, bool]:
     return is_turned, shell.astype(np.int64), bool((as_is == turned).any())
 
 
-def _inside_out(soup: Soup, shell: Ints) -> Bools:
+def _find_inside_out_shells(soup: Soup, shell: IntArray) -> BoolArray:
     """Return for each shell (S,) whether it must be turned over.
 
     A closed shell, all of whose edges belong to exactly two of its faces, is turned if
@@ -321,10 +331,10 @@ def _inside_out(soup: Soup, shell: Ints) -> Bools:
     face_counts = np.bincount(shell)
     vectors = soup.face_vectors()
     n_shells = len(face_counts)
-    edge_shell = shell[neighbours(soup.faces)[0] // 3]
+    edge_shell = shell[find_shared_edges(soup.faces)[0] // 3]
     paired_edges = np.bincount(edge_shell, minlength=n_shells) * 2
     is_closed = np.equal(paired_edges, 3 * face_counts)
-    volume = _signed_volumes(soup, shell, vectors, face_counts)
+    volume = _compute_signed_volumes(soup, shell, vectors, face_counts)
     toward = np.nan_to_num((soup.normals * vectors[:, None]).sum(axis=2)).sum(axis=1)
     # Agreement with the file's normals; 0 if it has none.
     agreement = np.bincount(shell, weights=toward, minlength=n_shells)
@@ -351,9 +361,9 @@ def _inside_out(soup: Soup, shell: Ints) -> Bools:
     return np.where(is_closed, is_inverted ^ mostly_negative, agreement < 0.0)
 
 
-def _signed_volumes(
-    soup: Soup, shell: Ints, vectors: Doubles, face_counts: Ints
-) -> Doubles:
+def _compute_signed_volumes(
+    soup: Soup, shell: IntArray, vectors: Float64Array, face_counts: IntArray
+) -> Float64Array:
     """Return six times the signed volume of each shell, (S,)."""
     corners = soup.points[soup.faces]
     sums = [
@@ -367,7 +377,7 @@ def _signed_volumes(
 # ---- Normals ----
 
 
-def _shaded(soup: Soup, notes: Notes) -> Soup:
+def _fix_normals(soup: Soup, notes: Notes) -> Soup:
     """Return the soup with a normal on the front of its face at every corner.
 
     The file's normals are kept if they agree with the faces on most of the surface.
@@ -380,55 +390,55 @@ def _shaded(soup: Soup, notes: Notes) -> Soup:
     if is_known.any():
         weight = np.where(is_known, area[:, None], 0.0)
         front_fraction = float((weight * is_front).sum() / weight.sum())
-        if front_fraction < 1.0 - TRUSTED:
-            notes.say("its normals pointed inwards and were turned around")
+        if front_fraction < 1.0 - MIN_NORMAL_AGREEMENT:
+            notes.warn("its normals pointed inwards and were turned around")
             normals = -normals
             is_front = is_known & ~is_front
-        elif front_fraction < TRUSTED:
-            notes.say("its normals contradict its faces and were computed anew")
+        elif front_fraction < MIN_NORMAL_AGREEMENT:
+            notes.warn("its normals contradict its faces and were computed anew")
             is_front = np.zeros_like(is_front)
     if not is_front.all():
-        computed = smooth_normals(soup)
+        computed = compute_smooth_normals(soup)
         if soup.flat is not None:
-            face_normals = unit_vectors(vectors)[:, None]
+            face_normals = normalize_vectors(vectors)[:, None]
             computed = np.where(soup.flat[:, None, None], face_normals, computed)
         normals = np.where((is_known & is_front)[:, :, None], normals, computed)
     return replace(soup, normals=normals)
 
 
-def smooth_normals(soup: Soup) -> Doubles:
+def compute_smooth_normals(soup: Soup) -> Float64Array:
     """Compute unit normals of corners (F, 3, 3), smooth except across creases.
 
     At each point, the faces that can be reached from one another over edges with less
     than the crease angle share one normal: the mean of their normals weighted by their
     angles at that point (Thuermer and Wuethrich 1998).
     """
-    face_normals = unit_vectors(soup.face_vectors())
-    left, right, same_direction = neighbours(soup.faces)
+    face_normals = normalize_vectors(soup.face_vectors())
+    left, right, same_direction = find_shared_edges(soup.faces)
     cosine = (face_normals[left // 3] * face_normals[right // 3]).sum(axis=1)
     is_smooth = cosine >= np.cos(np.radians(CREASE_DEGREES))
     left = left[is_smooth & ~same_direction]
     right = right[is_smooth & ~same_direction]
     # At either end of the edge, a corner of one face meets a corner of the other.
-    starts = np.concatenate([left, _next_corner(left)])
-    ends = np.concatenate([_next_corner(right), right])
-    group = connected(soup.faces.size, starts, ends)
-    weighted = face_normals[:, None] * _corner_angles(soup)[:, :, None]
-    sums: Doubles = np.stack(
+    starts = np.concatenate([left, _get_next_corner(left)])
+    ends = np.concatenate([_get_next_corner(right), right])
+    group = find_components(soup.faces.size, starts, ends)
+    weighted = face_normals[:, None] * _compute_corner_angles(soup)[:, :, None]
+    sums: Float64Array = np.stack(
         [np.bincount(group, weighted[:, :, k].ravel()) for k in range(3)], axis=1
     )
-    smooth = unit_vectors(sums)[group].reshape(-1, 3, 3)
+    smooth = normalize_vectors(sums)[group].reshape(-1, 3, 3)
     # False also for NaN, where normals cancel.
     is_valid = (smooth * face_normals[:, None]).sum(axis=2, keepdims=True) > 0.0
     return np.where(is_valid, smooth, face_normals[:, None])
 
 
-def _next_corner(corner: Ints) -> Ints:
+def _get_next_corner(corner: IntArray) -> IntArray:
     """Return the corners (3 face + k) that follow corners in their faces."""
     return corner - corner % 3 + (corner + 1) % 3
 
 
-def _corner_angles(soup: Soup) -> Doubles:
+def _compute_corner_angles(soup: Soup) -> Float64Array:
     """Return the angle in radians at each corner, (F, 3)."""
     corners = soup.points[soup.faces]
     to_next = np.roll(corners, -1, axis=1) - corners
@@ -438,14 +448,16 @@ def _corner_angles(soup: Soup) -> Doubles:
     return np.asarray(np.arctan2(sine, cosine))
 
 
-def _corners(values: Doubles | None, faces: Ints, width: int) -> Doubles:
+def _gather_at_corners(
+    values: Float64Array | None, faces: IntArray, width: int
+) -> Float64Array:
     """Return values (V, width) of vertices at corners, (F, 3, width); NaN for None."""
     if values is None:
         return np.full((len(faces), 3, width), np.nan)
     return values[faces]
 
 
-def unit_vectors(vectors: Doubles) -> Doubles:
+def normalize_vectors(vectors: Float64Array) -> Float64Array:
     """Scale vectors, along the last axis, to unit length.
 
     Vectors without a direction become NaN.
@@ -457,15 +469,18 @@ def unit_vectors(vectors: Doubles) -> Doubles:
     return np.where(np.isfinite(result).all(axis=-1, keepdims=True), result, np.nan)
 
 
-def connected(count: int, a: Ints, b: Ints) -> Ints:
+def find_components(count: int, edge_starts: IntArray, edge_ends: IntArray) -> IntArray:
     """Return the connected component (count,) of each node of a graph.
 
-    Edges are between the nodes `a` (E,) and `b` (E,).
+    Edges are between the nodes `edge_starts` (E,) and `edge_ends` (E,).
     """
     # Imported late, as in `parts`.
     from scipy.sparse import coo_array, csgraph
 
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
+    graph = coo_array(
+        (np.ones(len(edge_starts), np.int8), (edge_starts, edge_ends)),
+        shape=(count, count),
+    )
     _, component = csgraph.connected_components(graph, directed=False)
     return np.asarray(component, dtype=np.int64)
 
@@ -476,28 +491,32 @@ def connected(count: int, a: Ints, b: Ints) -> Ints:
 MOST_WORK = 50_000_000
 # Twice the area of a triangle, as a fraction of that of its polygon, up to which it
 # counts as having none.
-_FLAT = 1e-9
+_MIN_AREA = 1e-9
 
 
-def cut_up(points: Doubles, counts: Ints, notes: Notes) -> tuple[Ints, Ints]:
+def triangulate_and_note(
+    points: Float64Array, counts: IntArray, notes: Notes
+) -> tuple[IntArray, IntArray]:
     """Triangulate polygons, and note those that may be wrong.
 
-    Arguments and results are those of `triangulated`.
+    Arguments and results are those of `triangulate`.
     """
     n_degenerate = int((counts < 3).sum())
     if n_degenerate:
         plural = "" if n_degenerate == 1 else "s"
-        notes.say(f"{n_degenerate:,} face{plural} of fewer than 3 corners left out")
-    triangles, polygon, n_wrong = triangulated(points, counts)
+        notes.warn(f"{n_degenerate:,} face{plural} of fewer than 3 corners left out")
+    triangles, polygon, n_wrong = triangulate(points, counts)
     if n_wrong:
-        notes.say(
+        notes.warn(
             f"{n_wrong:,} faces cross themselves, or are too much work, and may be "
             "cut up wrongly"
         )
     return triangles, polygon
 
 
-def triangulated(points: Doubles, counts: Ints) -> tuple[Ints, Ints, int]:
+def triangulate(
+    points: Float64Array, counts: IntArray
+) -> tuple[IntArray, IntArray, int]:
     """Triangulate polygons.
 
     If the triangles from a polygon's first corner all face as the polygon does (it is
@@ -539,8 +558,8 @@ def triangulated(points: Doubles, counts: Ints) -> tuple[Ints, Ints, int]:
 
 
 def _triangulate_equal(
-    points: Doubles, corners: Ints, budget: int
-) -> tuple[Ints, int, int]:
+    points: Float64Array, corners: IntArray, budget: int
+) -> tuple[IntArray, int, int]:
     """Triangulate polygons (P, n) with the same number of corners.
 
     Args:
@@ -557,19 +576,19 @@ def _triangulate_equal(
     fans = np.stack([first, corners[:, 1:-1], corners[:, 2:]], axis=2)
     if count == 3:
         return fans, 0, 0
-    flat = _flattened(points[corners])
-    areas = _doubled_areas(flat[:, :1], flat[:, 1:-1], flat[:, 2:])
-    min_area = _FLAT * np.abs(areas.sum(axis=1))[:, None]
+    flat = _project_to_planes(points[corners])
+    areas = _compute_doubled_areas(flat[:, :1], flat[:, 1:-1], flat[:, 2:])
+    min_area = _MIN_AREA * np.abs(areas.sum(axis=1))[:, None]
     concave = np.flatnonzero((areas <= min_area).any(axis=1))
     if not len(concave):
         return fans, 0, 0
-    ears, n_failed, used = _ears(flat[concave], budget)
+    ears, n_failed, used = _cut_ears(flat[concave], budget)
     rows = np.arange(len(concave))[:, None, None]
     fans[concave] = corners[concave][rows, ears]
     return fans, n_failed, used
 
 
-def _flattened(corners: Doubles) -> Doubles:
+def _project_to_planes(corners: Float64Array) -> Float64Array:
     """Project polygons (P, n, 3) to their planes, (P, n, 2).
 
     They are counter-clockwise and about 1 large.
@@ -586,14 +605,16 @@ def _flattened(corners: Doubles) -> Doubles:
     return np.asarray(corners @ plane)
 
 
-def _doubled_areas(a: Doubles, b: Doubles, c: Doubles) -> Doubles:
+def _compute_doubled_areas(
+    a: Float64Array, b: Float64Array, c: Float64Array
+) -> Float64Array:
     """Return twice the signed area of triangles with corners (..., 2)."""
     to_b = b - a
     to_c = c - a
     return np.asarray(to_b[..., 0] * to_c[..., 1] - to_b[..., 1] * to_c[..., 0])
 
 
-def _ears(flat: Doubles, budget: int) -> tuple[Ints, int, int]:
+def _cut_ears(flat: Float64Array, budget: int) -> tuple[IntArray, int, int]:
     """Triangulate polygons (P, n, 2) by cutting off ears, in all polygons in parallel.
 
     Each polygon has a tip, the corner that is tried next. If the triangle of the tip
@@ -601,7 +622,7 @@ def _ears(flat: Doubles, budget: int) -> tuple[Ints, int, int]:
     polygon whose corners have all been tried has no ear, and its tip is cut off anyway.
 
     Args:
-        flat: polygons as `_flattened` returns them.
+        flat: polygons as `_project_to_planes` returns them.
         budget: limit of the comparisons; then all ears are cut off untested.
 
     Returns:
@@ -616,7 +637,7 @@ def _ears(flat: Doubles, budget: int) -> tuple[Ints, int, int]:
     n_cut, tip, n_tries = (np.zeros(count, dtype=np.int64) for _ in range(3))
     is_failed = np.zeros(count, dtype=np.bool_)
     area = np.abs(
-        _doubled_areas(flat, np.roll(flat, -1, axis=1), np.zeros(2)).sum(axis=1)
+        _compute_doubled_areas(flat, np.roll(flat, -1, axis=1), np.zeros(2)).sum(axis=1)
     )
     dent, is_present = _find_dents(flat, area)
     dent_points = np.take_along_axis(flat, dent[:, :, None], axis=1)
@@ -636,7 +657,7 @@ def _ears(flat: Doubles, budget: int) -> tuple[Ints, int, int]:
                 corners,
                 dent_points[active],
                 is_present[active],
-                _FLAT * area[active],
+                _MIN_AREA * area[active],
             )
         else:
             is_hopeless[:] = True
@@ -655,10 +676,10 @@ def _ears(flat: Doubles, budget: int) -> tuple[Ints, int, int]:
         n_tries[rows] = 0
         n_cut[rows] += 1
         active = active[n_cut[active] < n_corners - 2]
-    return triangles, int((is_failed & (area > _FLAT)).sum()), n_compared
+    return triangles, int((is_failed & (area > _MIN_AREA)).sum()), n_compared
 
 
-def _find_dents(flat: Doubles, area: Doubles) -> tuple[Ints, Bools]:
+def _find_dents(flat: Float64Array, area: Float64Array) -> tuple[IntArray, BoolArray]:
     """Find the corners of polygons (P, n, 2) that are not convex.
 
     Only these can lie in an ear.
@@ -668,15 +689,20 @@ def _find_dents(flat: Doubles, area: Doubles) -> tuple[Ints, Bools]:
     """
     previous = np.roll(flat, 1, axis=1)
     following = np.roll(flat, -1, axis=1)
-    is_dent = _doubled_areas(previous, flat, following) <= _FLAT * area[:, None]
+    is_dent = (
+        _compute_doubled_areas(previous, flat, following) <= _MIN_AREA * area[:, None]
+    )
     max_dents = int(is_dent.sum(axis=1).max())
     dent = np.argsort(~is_dent, axis=1, kind="stable")[:, :max_dents]
     return dent, np.take_along_axis(is_dent, dent, axis=1)
 
 
 def _is_ear(
-    corners: list[Doubles], points: Doubles, is_present: Bools, min_area: Doubles
-) -> Bools:
+    corners: list[Float64Array],
+    points: Float64Array,
+    is_present: BoolArray,
+    min_area: Float64Array,
+) -> BoolArray:
     """Return which triangles have an area and contain no present point, (P,).
 
     Args:
@@ -685,7 +711,7 @@ def _is_ear(
         is_present: (P, n) which of the points count.
         min_area: (P,) twice the area up to which a triangle has none.
     """
-    is_ear: Bools = _doubled_areas(*corners) > min_area
+    is_ear: BoolArray = _compute_doubled_areas(*corners) > min_area
     x = points[is_ear, :, 0]
     y = points[is_ear, :, 1]
     is_inside = is_present[is_ear]

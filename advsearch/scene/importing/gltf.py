@@ -16,15 +16,15 @@ from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
-from advsearch.scene.assets import Doubles, Ints
+from advsearch.scene.assets import Float64Array, IntArray
 from advsearch.scene.importing.files import (
-    SPLATS,
+    SPLATS_ADVICE,
     check_faces,
     damaged,
+    decode_text,
+    describe_content,
     find_kind,
-    looks_like,
-    shown,
-    text_of,
+    format_name,
 )
 from advsearch.scene.importing.gltf_entries import Asset, Entry, Header, Primitive
 from advsearch.trust.named_files import References, plain_name
@@ -44,15 +44,15 @@ def read_header(path: Path, data: bytes) -> Header:
             types in its header than glTF has, refers to what is not there, is over a
             limit, or needs what is not supported.
     """
-    chunk, _ = _chunks(path, data)
+    chunk, _ = _split_chunks(path, data)
     content = _parse_content(path, chunk)
     try:
         version = Asset.model_validate(content["asset"]).version
         if version.split(".")[0] != "2":
-            raise damaged(path, "glTF of version 2", f"version {shown(version)}")
+            raise damaged(path, "glTF of version 2", f"version {format_name(version)}")
         header = Header.model_validate(content)
     except ValidationError as error:
-        raise _invalid_entry(path, error) from None
+        raise _make_entry_error(path, error) from None
     extensions = _find_extensions(path, content)
     entries = zip(header.nodes, content.get("nodes", ()), strict=True)
     for index, (node, entry) in enumerate(entries):
@@ -72,7 +72,7 @@ def read_header(path: Path, data: bytes) -> Header:
 
 def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
     """Parse the JSON of a header, which must have an asset."""
-    text = text_of(chunk)
+    text = decode_text(chunk)
     check_most(
         path,
         sum(map(text.count, ",[{")),
@@ -93,7 +93,7 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
     return content
 
 
-def _invalid_entry(path: Path, error: ValidationError) -> FileFormatError:
+def _make_entry_error(path: Path, error: ValidationError) -> FileFormatError:
     """Return the error for the first entry of a header that is invalid."""
     first = error.errors(include_url=False)[0]
     keys = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in first["loc"])
@@ -101,7 +101,7 @@ def _invalid_entry(path: Path, error: ValidationError) -> FileFormatError:
     if first["type"] == "missing":
         return damaged(path, f"glTF with {location}", "nothing")
     needed = first["msg"].removeprefix("Input should be ").removeprefix("Field ")
-    got = shown(json.dumps(first["input"], default=str))
+    got = format_name(json.dumps(first["input"], default=str))
     return damaged(path, f"glTF whose {location} is {needed}", got)
 
 
@@ -122,24 +122,26 @@ def _find_extensions(path: Path, content: JsonValue) -> set[str]:
             if held is None:
                 held = {}
             are_objects = isinstance(held, dict) and all(
-                isinstance(held.get(name) or {}, dict) for name in READ
+                isinstance(held.get(name) or {}, dict) for name in SUPPORTED_EXTENSIONS
             )
             if not isinstance(held, dict) or not are_objects:
                 raise damaged(
-                    path, "glTF whose extensions are objects", shown(json.dumps(held))
+                    path,
+                    "glTF whose extensions are objects",
+                    format_name(json.dumps(held)),
                 )
             extensions.update(held)
             stack.extend(value for key, value in entry.items() if key != "extras")
     return extensions
 
 
-def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
+def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
     """Return the JSON of a file, and the binary chunk of a .glb file or None."""
     if path.suffix.lower() == ".gltf":
         return data, None
     has_magic = data.startswith(b"glTF")
     if not has_magic or len(data) < 20:
-        got = "the first few bytes of one" if has_magic else looks_like(data)
+        got = "the first few bytes of one" if has_magic else describe_content(data)
         raise damaged(path, "a binary glTF file", got)
     version, length, json_size, kind = struct.unpack_from("<4xIII4s", data)
     if version != 2:
@@ -154,7 +156,7 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
         raise damaged(
             path,
             "a chunk of JSON first",
-            f"{json_size} bytes of {shown(kind.decode('latin-1'))}",
+            f"{json_size} bytes of {format_name(kind.decode('latin-1'))}",
         )
     binary_start = 28 + json_size
     binary = None
@@ -166,25 +168,25 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
     return data[20 : 20 + json_size].rstrip(b"\0"), binary
 
 
-LARGEST_VALUES = 1 << 28
+MAX_DATA_SIZE = 1 << 28
 """Limit of the bytes of all views, and of all accessors, of a file; they may overlap, so
 the size of the file is no bound.
 """
 LARGEST_TREE = 20_000  # limit of the nodes, and of the drawn primitives, of a file
 DEEPEST_TREE = 500  # limit of the nodes from the root to a leaf
-READ = tuple(
+SUPPORTED_EXTENSIONS = tuple(
     "EXT_texture_webp KHR_lights_punctual KHR_materials_emissive_strength "
     "KHR_materials_pbrSpecularGlossiness "
     "KHR_mesh_quantization KHR_texture_transform VRM VRMC_vrm".split()
 )
 """Extensions that are understood."""
-_LOOKS = ("KHR_materials_", "KHR_xmp")
+_APPEARANCE_PREFIXES = ("KHR_materials_", "KHR_xmp")
 """Prefixes of extensions without which a file looks different but has the same geometry:
 warnings name them.
 """
 
 
-def is_of_splats(name: str) -> bool:
+def is_splat_name(name: str) -> bool:
     """Return whether an extension or attribute holds Gaussian splats.
 
     These are KHR_gaussian_splatting and the extensions that compress it.
@@ -202,12 +204,13 @@ def check_header(path: Path, header: Header) -> None:
     needed = sorted(
         name
         for name in header.extensionsRequired
-        if name not in READ and not name.startswith(_LOOKS)
+        if name not in SUPPORTED_EXTENSIONS
+        and not name.startswith(_APPEARANCE_PREFIXES)
     )
     if needed:
-        raise _needs(path, needed)
-    for entry in header.entries():
-        for kind, index in entry.references():
+        raise _make_unsupported_error(path, needed)
+    for entry in header.iterate_entries():
+        for kind, index in entry.iterate_references():
             count = len(getattr(header, kind))
             if index >= count:
                 raise damaged(
@@ -223,14 +226,16 @@ def check_header(path: Path, header: Header) -> None:
                 f"{n_samplers}",
             )
     accessor_sizes = (
-        entry.count * entry.width * np.dtype(_TYPES[entry.componentType]).itemsize
+        entry.count
+        * entry.width
+        * np.dtype(_COMPONENT_TYPES[entry.componentType]).itemsize
         for entry in header.accessors
     )
     view_size = sum(view.byteLength for view in header.bufferViews)
     check_most(
         path,
         max(view_size, sum(accessor_sizes)),
-        LARGEST_VALUES,
+        MAX_DATA_SIZE,
         "geometry and pictures of at most {} bytes",
     )
     for mesh in header.meshes:
@@ -239,22 +244,24 @@ def check_header(path: Path, header: Header) -> None:
     _check_tree(path, header)
 
 
-def _needs(path: Path, names: Iterable[str]) -> FileFormatError:
+def _make_unsupported_error(path: Path, names: Iterable[str]) -> FileFormatError:
     """Return the error for a file that needs extensions that are not supported."""
     names = list(names)
-    if any(map(is_of_splats, names)):
-        return FileFormatError(f"{path}: needs Gaussian splats, a model that {SPLATS}")
-    text = shown(", ".join(names), quoted=False)
+    if any(map(is_splat_name, names)):
+        return FileFormatError(
+            f"{path}: needs Gaussian splats, a model that {SPLATS_ADVICE}"
+        )
+    text = format_name(", ".join(names), quoted=False)
     return FileFormatError(
         f"{path}: needs {text}, which is not supported; export it without that option"
     )
 
 
-def unread_extensions(entry: Entry) -> list[str]:
+def find_unread_extensions(entry: Entry) -> list[str]:
     """Return the names of an entry's extensions that are not understood."""
     if not isinstance(entry.extensions, dict):
         return []
-    return sorted(name for name in entry.extensions if name not in READ)
+    return sorted(name for name in entry.extensions if name not in SUPPORTED_EXTENSIONS)
 
 
 def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
@@ -264,7 +271,7 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
     }
     uv_name = "TEXCOORD_0"
     if primitive.material is not None:
-        uv_name = header.materials[primitive.material].attribute
+        uv_name = header.materials[primitive.material].uv_attribute
     valid_types = {
         "POSITION": ("VEC3",),
         "NORMAL": ("VEC3",),
@@ -282,14 +289,14 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
             expected = f"as many values of {name} as of POSITION, {positions.count:,}"
             raise damaged(path, expected, f"{accessor.count:,}")
     indices = None if primitive.indices is None else header.accessors[primitive.indices]
-    unread = unread_extensions(primitive)
-    is_packed = unread and not any(map(is_of_splats, unread))
+    unread = find_unread_extensions(primitive)
+    is_packed = unread and not any(map(is_splat_name, unread))
     for values in (*accessors.values(), indices):
         has_no_data = (
             values is not None and values.bufferView is None and values.sparse is None
         )
         if has_no_data and is_packed:  # an extension has the numbers, such as Draco's
-            raise _needs(path, unread)
+            raise _make_unsupported_error(path, unread)
     if indices is not None and indices.type != "SCALAR":
         raise damaged(path, "indices of type SCALAR", indices.type)
     if indices is not None and indices.componentType not in (5121, 5123, 5125):
@@ -299,7 +306,7 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
 def _check_tree(path: Path, header: Header) -> None:
     """Check the number of triangles and primitives, and that nodes form trees."""
     triangles = [
-        sum(_max_triangles(header, primitive) for primitive in mesh.primitives)
+        sum(_count_max_triangles(header, primitive) for primitive in mesh.primitives)
         for mesh in header.meshes
     ]
     primitives = [len(mesh.primitives) for mesh in header.meshes]
@@ -333,7 +340,7 @@ def _check_tree(path: Path, header: Header) -> None:
         raise damaged(path, "nodes that form trees", "a cycle")
 
 
-def _max_triangles(header: Header, primitive: Primitive) -> int:
+def _count_max_triangles(header: Header, primitive: Primitive) -> int:
     """Return an upper bound of the number of triangles of a primitive."""
     index = primitive.indices
     if index is None:
@@ -344,7 +351,14 @@ def _max_triangles(header: Header, primitive: Primitive) -> int:
     return count // 3 if primitive.mode == 4 else max(0, count - 2)
 
 
-_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_COMPONENT_TYPES = {
+    5120: "<i1",
+    5121: "<u1",
+    5122: "<i2",
+    5123: "<u2",
+    5125: "<u4",
+    5126: "<f4",
+}
 
 
 class GltfFile:
@@ -360,11 +374,11 @@ class GltfFile:
         self.path = path
         self.header = read_header(path, data)
         self.references = References(path)
-        _, self._chunk = _chunks(path, data)
+        _, self._chunk = _split_chunks(path, data)
         self._buffers: dict[int, bytes] = {}
         self._with_sparse: dict[int, npt.NDArray[Any]] = {}
 
-    def uri(self, uri: str) -> bytes:
+    def load_uri(self, uri: str) -> bytes:
         """Return the content of a data URI, or of the file in the folder that it names.
 
         Raises:
@@ -378,14 +392,14 @@ class GltfFile:
         data = unquote_to_bytes(content)
         return base64.b64decode(data) if kind.endswith(";base64") else data
 
-    def view(self, index: int) -> memoryview:
+    def get_view(self, index: int) -> memoryview:
         """Return the bytes of a buffer view.
 
         Raises:
             FileFormatError: they are not there.
         """
         view = self.header.bufferViews[index]
-        data = self._buffer(view.buffer)
+        data = self._load_buffer(view.buffer)
         end = view.byteOffset + view.byteLength
         if end > len(data):
             raise damaged(
@@ -395,23 +409,23 @@ class GltfFile:
             )
         return memoryview(data)[view.byteOffset : end]
 
-    def _buffer(self, index: int) -> bytes:
+    def _load_buffer(self, index: int) -> bytes:
         """Return the bytes of a buffer, which are loaded on first use."""
         if index in self._buffers:
             return self._buffers[index]
         uri = self.header.buffers[index].uri
         try:
             if uri is not None:
-                data = self.uri(uri)
+                data = self.load_uri(uri)
             elif index == 0 and self._chunk is not None:
                 data = self._chunk
             else:
-                raise self._without_content(index)
+                raise self._make_empty_buffer_error(index)
         except FileNotFoundError:
             name = plain_name(uri or "")
             reason = self.references.refused.get(name, "is missing")
             message = (
-                f"{self.path}: needs {shown(name)}, which {reason}; put "
+                f"{self.path}: needs {format_name(name)}, which {reason}; put "
                 "that "
                 "file beside it"
             )
@@ -423,20 +437,20 @@ class GltfFile:
         self._buffers[index] = data
         return data
 
-    def _without_content(self, index: int) -> FileFormatError:
+    def _make_empty_buffer_error(self, index: int) -> FileFormatError:
         """Return the error for a buffer without data."""
         # An extension of its views may have the data, such as meshopt's.
         unread = {
             name
             for view in self.header.bufferViews
             if view.buffer == index
-            for name in unread_extensions(view)
+            for name in find_unread_extensions(view)
         }
         if unread:
-            return _needs(self.path, sorted(unread))
+            return _make_unsupported_error(self.path, sorted(unread))
         return damaged(self.path, f"a buffer {index} with content", "none")
 
-    def values(self, index: int) -> npt.NDArray[Any]:
+    def read_values(self, index: int) -> npt.NDArray[Any]:
         """Return the values (count, width) of an accessor as they are stored.
 
         Sparse values are filled in.
@@ -448,11 +462,11 @@ class GltfFile:
             return self._with_sparse[index]
         accessor = self.header.accessors[index]
         values = np.zeros(
-            (accessor.count, accessor.width), _TYPES[accessor.componentType]
+            (accessor.count, accessor.width), _COMPONENT_TYPES[accessor.componentType]
         )
         if accessor.bufferView is not None and accessor.count:
             stride = self.header.bufferViews[accessor.bufferView].byteStride
-            values = self._array(
+            values = self._make_array(
                 accessor.bufferView,
                 accessor.byteOffset,
                 values.shape,
@@ -468,11 +482,11 @@ class GltfFile:
             raise damaged(
                 self.path, f"at most {accessor.count:,} sparse values", f"{count:,}"
             )
-        rows = self._array(
+        rows = self._make_array(
             sparse_indices.bufferView,
             sparse_indices.byteOffset,
             (count, 1),
-            np.dtype(_TYPES[sparse_indices.componentType]),
+            np.dtype(_COMPONENT_TYPES[sparse_indices.componentType]),
         )[:, 0]
         if rows.max() >= accessor.count:
             raise damaged(
@@ -481,7 +495,7 @@ class GltfFile:
                 f"{int(rows.max()):,}",
             )
         values = np.array(values)
-        values[rows] = self._array(
+        values[rows] = self._make_array(
             sparse_values.bufferView,
             sparse_values.byteOffset,
             (count, accessor.width),
@@ -490,7 +504,7 @@ class GltfFile:
         self._with_sparse[index] = values
         return values
 
-    def _array(
+    def _make_array(
         self,
         view: int,
         offset: int,
@@ -503,7 +517,7 @@ class GltfFile:
         Raises:
             FileFormatError: the view is too short.
         """
-        data = self.view(view)
+        data = self.get_view(view)
         row_size = shape[1] * kind.itemsize
         step = stride or row_size
         end = offset + (shape[0] - 1) * step + row_size
@@ -516,14 +530,14 @@ class GltfFile:
         )
         return values
 
-    def numbers(self, index: int, rows: Ints) -> Doubles:
+    def read_numbers(self, index: int, rows: IntArray) -> Float64Array:
         """Return rows (N,) of an accessor as float64 (N, width).
 
         Normalised integers are converted to the numbers in [-1, 1] for which they
         stand.
         """
-        values = self.values(index)[rows]
-        numbers: Doubles = values.astype(np.float64)
+        values = self.read_values(index)[rows]
+        numbers: Float64Array = values.astype(np.float64)
         if not self.header.accessors[index].normalized or values.dtype.kind == "f":
             return numbers
         return np.asarray(numbers / np.iinfo(values.dtype).max).clip(-1.0)

@@ -30,7 +30,7 @@ Unread = Annotated[JsonValue, Field(exclude=True)]
 """A value that is never read: it has a warning of its own, or changes nothing."""
 Index = Annotated[int, Field(ge=0, lt=1 << 32)]
 Size = Annotated[int, Field(ge=0, lt=1 << 40)]
-_ELEMENTS = {
+_WIDTH_OF_TYPE = {
     "SCALAR": 1,
     "VEC2": 2,
     "VEC3": 3,
@@ -41,7 +41,7 @@ _ELEMENTS = {
 }
 
 
-REFERENCES = {
+REFERENCED_LISTS = {
     **dict.fromkeys(
         ("attributes", "indices", "targets", "input", "output", "inverseBindMatrices"),
         "accessors",
@@ -74,7 +74,7 @@ class Entry(BaseModel):
     )
     extensions: Unread = None  # as they are in the file
 
-    def entries(self) -> Iterator[Entry]:
+    def iterate_entries(self) -> Iterator[Entry]:
         """Yield this entry, and all entries within it."""
         queue: list[object] = [self]
         for item in queue:  # it grows
@@ -86,7 +86,7 @@ class Entry(BaseModel):
                 queue.extend(child for child in children if isinstance(child, Entry))
 
     @classmethod
-    def read_of_extensions(cls) -> dict[str, set[str]]:
+    def list_extension_keys(cls) -> dict[str, set[str]]:
         """Return the keys that are read of each extension.
 
         They are empty if an extension is an entry itself.
@@ -98,18 +98,18 @@ class Entry(BaseModel):
                 keys_of_extension.setdefault(path[1], set()).update(path[2:3])
         return keys_of_extension
 
-    def references(self) -> Iterator[tuple[str, int]]:
+    def iterate_references(self) -> Iterator[tuple[str, int]]:
         """Yield a list of the header, and an index in it, for each reference."""
         for name, value in vars(self).items():
-            queue: list[Any] = [value] if name in REFERENCES else []
+            queue: list[Any] = [value] if name in REFERENCED_LISTS else []
             for item in queue:  # it grows
                 if isinstance(item, int):
-                    yield REFERENCES[name], item
+                    yield REFERENCED_LISTS[name], item
                 elif isinstance(item, (list, dict)):
                     queue.extend(item.values() if isinstance(item, dict) else item)
 
 
-def _extension(*path: str, default: Any = None) -> Any:
+def _extension_field(*path: str, default: Any = None) -> Any:
     """Return a field whose value is in an extension of the entry."""
     return Field(default=default, validation_alias=AliasPath("extensions", *path))
 
@@ -161,7 +161,7 @@ class Accessor(Entry):
     @property
     def width(self) -> int:
         """How many numbers one of its values has."""
-        return _ELEMENTS[self.type]
+        return _WIDTH_OF_TYPE[self.type]
 
 
 class Primitive(Entry):
@@ -187,7 +187,7 @@ class Node(Entry):
     camera: Index | None = None
     skin: Index | None = None
     # Index of the light of the node.
-    lamp: Index | None = _extension("KHR_lights_punctual", "light")
+    lamp: Index | None = _extension_field("KHR_lights_punctual", "light")
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
     translation: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     rotation: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
@@ -274,7 +274,7 @@ class LightEntry(Entry):
 
 
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
-Map = Annotated[int, Field(ge=0, lt=256)]
+UvSetIndex = Annotated[int, Field(ge=0, lt=256)]
 
 
 class TextureTransform(Entry):
@@ -283,30 +283,32 @@ class TextureTransform(Entry):
     offset: Pair = [0.0, 0.0]
     rotation: float = 0.0
     scale: Pair = [1.0, 1.0]
-    texCoord: Map | None = None
+    texCoord: UvSetIndex | None = None
 
 
 class TextureUse(Entry):
     index: Index
-    texCoord: Map = 0
+    texCoord: UvSetIndex = 0
     transform: Annotated[
         TextureTransform, BeforeValidator(lambda value: value or {})
-    ] = _extension("KHR_texture_transform", default=TextureTransform())
+    ] = _extension_field("KHR_texture_transform", default=TextureTransform())
     """Transform of the texture coordinates."""
 
     @property
-    def attribute(self) -> str:
+    def uv_attribute(self) -> str:
         """Name of the attribute with its texture coordinates."""
         other = self.transform.texCoord
         return f"TEXCOORD_{self.texCoord if other is None else other}"
 
-    def looked_up_as(self, other: TextureUse) -> bool:
+    def has_same_coordinates(self, other: TextureUse) -> bool:
         """Return whether another texture has the same coordinates and transform."""
         transforms = [
             (transform.offset, transform.rotation, transform.scale)
             for transform in (self.transform, other.transform)
         ]
-        return self.attribute == other.attribute and transforms[0] == transforms[1]
+        return (
+            self.uv_attribute == other.uv_attribute and transforms[0] == transforms[1]
+        )
 
 
 class NormalUse(TextureUse):
@@ -330,9 +332,12 @@ class SpecularGlossiness(Entry):
     glossinessFactor: float = 1.0
 
 
-CUT_OUTS = ("MASK", "BLEND")  # modes in which the alpha of the base color counts
+TRANSPARENT_MODES = (
+    "MASK",
+    "BLEND",
+)  # modes in which the alpha of the base color counts
 # Default alpha below which a masked surface is cut out.
-CUTOFF = 0.5
+DEFAULT_ALPHA_CUTOFF = 0.5
 
 
 class MaterialEntry(Entry):
@@ -344,13 +349,13 @@ class MaterialEntry(Entry):
         list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)
     ] = [0.0] * 3
     alphaMode: str = "OPAQUE"
-    alphaCutoff: float = CUTOFF
+    alphaCutoff: float = DEFAULT_ALPHA_CUTOFF
     doubleSided: Unread = None
     occlusionTexture: Unread = None
-    strength: Annotated[float, Field(ge=0.0)] = _extension(
+    strength: Annotated[float, Field(ge=0.0)] = _extension_field(
         "KHR_materials_emissive_strength", "emissiveStrength", default=1.0
     )
-    glossiness: SpecularGlossiness | None = _extension(
+    glossiness: SpecularGlossiness | None = _extension_field(
         "KHR_materials_pbrSpecularGlossiness"
     )
 
@@ -371,23 +376,31 @@ class MaterialEntry(Entry):
         )
 
     @property
-    def layout(self) -> TextureUse | None:
+    def layout_texture(self) -> TextureUse | None:
         """The texture whose coordinates the mesh gets: that of the base color, if any."""
         return (
             self.surface.baseColorTexture or self.normalTexture or self.emissiveTexture
         )
 
     @property
-    def attribute(self) -> str:
+    def uv_attribute(self) -> str:
         """Name of the attribute with the texture coordinates that are read."""
-        return "TEXCOORD_0" if self.layout is None else self.layout.attribute
+        return (
+            "TEXCOORD_0"
+            if self.layout_texture is None
+            else self.layout_texture.uv_attribute
+        )
 
-    def reads(self, use: TextureUse | None) -> bool:
+    def can_read(self, use: TextureUse | None) -> bool:
         """Return whether a texture has the coordinates of `layout`, or is None.
 
         Others are left out.
         """
-        return use is None or self.layout is None or use.looked_up_as(self.layout)
+        return (
+            use is None
+            or self.layout_texture is None
+            or use.has_same_coordinates(self.layout_texture)
+        )
 
     @property
     def emission(self) -> list[float]:
@@ -413,7 +426,7 @@ class Sampler(Entry):
 class Texture(Entry):
     source: Index | None = None
     sampler: Index | None = None
-    webp: Index | None = _extension("EXT_texture_webp", "source")
+    webp: Index | None = _extension_field("EXT_texture_webp", "source")
 
     @property
     def image(self) -> int | None:
@@ -445,17 +458,21 @@ class Header(Entry):
     cameras: List[CameraEntry] = []
     skins: List[Skin] = []
     animations: List[Animation] = []
-    vrm: dict[str, HumanBone] = _extension(
+    vrm: dict[str, HumanBone] = _extension_field(
         "VRMC_vrm", "humanoid", "humanBones", default={}
     )
     """The bones of a person by the names of VRM 1."""
-    vrm_0: List[HumanBone] = _extension("VRM", "humanoid", "humanBones", default=[])
-    lights: List[LightEntry] = _extension("KHR_lights_punctual", "lights", default=[])
+    vrm_0: List[HumanBone] = _extension_field(
+        "VRM", "humanoid", "humanBones", default=[]
+    )
+    lights: List[LightEntry] = _extension_field(
+        "KHR_lights_punctual", "lights", default=[]
+    )
     """The lights that nodes may carry."""
     extensionsUsed: List[str] = []
     extensionsRequired: List[str] = []
 
-    def below(self, nodes: Iterable[int]) -> set[int]:
+    def find_descendants(self, nodes: Iterable[int]) -> set[int]:
         """Return nodes and all their descendants."""
         reached = set[int]()
         level = set(nodes)
@@ -474,7 +491,7 @@ class Header(Entry):
                 parents[child] = index
         return parents
 
-    def label(self, index: int) -> str:
+    def get_label(self, index: int) -> str:
         """Return the name of a node, or of its mesh, or its index in words."""
         node = self.nodes[index]
         mesh_name = None if node.mesh is None else self.meshes[node.mesh].name

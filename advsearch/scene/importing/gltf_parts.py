@@ -14,19 +14,30 @@ from typing import NamedTuple
 import numpy as np
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Doubles, Floats, Ints, face_vectors
+from advsearch.scene.assets import (
+    Float32Array,
+    Float64Array,
+    IntArray,
+    compute_area_vectors,
+)
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import gltf_entries, gltf_skeleton
-from advsearch.scene.importing.files import SPLATS, Notes, check_faces, damaged, shown
+from advsearch.scene.importing.files import (
+    SPLATS_ADVICE,
+    Notes,
+    check_faces,
+    damaged,
+    format_name,
+)
 from advsearch.scene.importing.gltf import (
-    READ,
+    SUPPORTED_EXTENSIONS,
     GltfFile,
-    is_of_splats,
-    unread_extensions,
+    find_unread_extensions,
+    is_splat_name,
 )
 from advsearch.scene.importing.gltf_entries import (
-    CUT_OUTS,
     GENERATOR,
+    TRANSPARENT_MODES,
     Header,
     MaterialEntry,
     Primitive,
@@ -34,27 +45,27 @@ from advsearch.scene.importing.gltf_entries import (
     TextureUse,
 )
 from advsearch.scene.importing.parts import (
-    FLAT,
+    FLAT_TEXEL,
     ImportedPart,
     ImportedSurface,
-    instead_of_texture,
-    limited_radiance,
-    normal_map,
-    placed,
-    unit,
-    with_opacity,
+    apply_opacity,
+    clip_to_unit,
+    compute_radiance,
+    describe_substitute,
+    make_normal_map,
+    transform_part,
 )
-from advsearch.scene.importing.pictures import TEXTURE_LIMIT, FilePictures, Kind
-from advsearch.scene.importing.texture import mean_over
+from advsearch.scene.importing.pictures import TEXTURE_LIMIT, FileImages, ImageKind
+from advsearch.scene.importing.texture import average_over_faces
 from advsearch.scene.importing.unread import TrackedKeys
-from advsearch.scene.skeleton import Movable, Skeleton, Target
+from advsearch.scene.skeleton import MorphTarget, Movable, Skeleton
 
 # ---- Notes on what a glTF file has and our scenes do not have ----
 #
 # Nothing is dropped silently. The caller prepends the name of the file.
 
 _OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
-EXTENSIONS = {
+EXTENSION_NOTES = {
     "EXT_mesh_gpu_instancing": " repeats meshes with {name}; each is there once",
     "KHR_materials_diffuse_transmission": _OPAQUE,
     "KHR_materials_pbrSpecularGlossiness": " has {name}, of which only diffuse colour "
@@ -65,13 +76,13 @@ EXTENSIONS = {
     "KHR_materials_variants": " has variants of its materials ({name}); those that it "
     "shows by itself are taken",
 }
-"""Sentence about each extension; `UNKNOWN` is that of all others not understood."""
-UNKNOWN = " uses {name}, which is not understood and left out"
-LONGEST_SENTENCE = 500  # characters of what the reader of OpenUSD says
-FAR = 1000.0  # distance of a directional light, in object sizes
+"""Sentence about each extension; `UNKNOWN_EXTENSION_NOTE` is that of all others not understood."""
+UNKNOWN_EXTENSION_NOTE = " uses {name}, which is not understood and left out"
+MAX_SENTENCE_LENGTH = 500  # characters of what the reader of OpenUSD says
+DIRECTIONAL_LIGHT_DISTANCE = 1000.0  # distance of a directional light, in object sizes
 
 
-def left_out(header: Header, notes: Notes) -> None:
+def note_left_out(header: Header, notes: Notes) -> None:
     """Note what a file has that is not imported.
 
     It is the same whether one node of the file or all of it is the object.
@@ -80,35 +91,41 @@ def left_out(header: Header, notes: Notes) -> None:
     if is_converted and isinstance(header.asset.extras, dict):
         sentences = header.asset.extras.get("left_out")
         for sentence in sentences if isinstance(sentences, list) else ():
-            notes.say(
-                " " + shown(str(sentence), quoted=False, longest=LONGEST_SENTENCE)
+            notes.warn(
+                " "
+                + format_name(
+                    str(sentence), quoted=False, max_length=MAX_SENTENCE_LENGTH
+                )
             )
     used = {*header.extensionsUsed, *header.extensionsRequired}
-    if any(map(is_of_splats, used)):
-        notes.say(f" has Gaussian splats, which are left out: a model that {SPLATS}")
-    for name in sorted(used & set(EXTENSIONS) | used - set(READ)):
-        if not is_of_splats(name):
-            sentence = EXTENSIONS.get(name, UNKNOWN)
-            notes.say(sentence.format(name=shown(name, quoted=False)))
+    if any(map(is_splat_name, used)):
+        notes.warn(
+            f" has Gaussian splats, which are left out: a model that {SPLATS_ADVICE}"
+        )
+    for name in sorted(used & set(EXTENSION_NOTES) | used - set(SUPPORTED_EXTENSIONS)):
+        if not is_splat_name(name):
+            sentence = EXTENSION_NOTES.get(name, UNKNOWN_EXTENSION_NOTE)
+            notes.warn(sentence.format(name=format_name(name, quoted=False)))
     roots: Iterable[int] = range(len(header.nodes))
     if header.scenes:
         roots = header.scenes[header.scene or 0].nodes
-    in_scene = header.below(roots)
+    in_scene = header.find_descendants(roots)
     materials = header.materials
     kinds = {
         "occlusion map{s}: left out": (
             material.occlusionTexture is not None for material in materials
         ),
         "normal map{s} with other texture coordinates than the base colour: left out": (
-            not material.reads(material.normalTexture) for material in materials
+            not material.can_read(material.normalTexture) for material in materials
         ),
         "emission texture{s} with other coordinates than the base colour: left out, "
         "with the emission": (
-            any(material.emission) and not material.reads(material.emissiveTexture)
+            any(material.emission) and not material.can_read(material.emissiveTexture)
             for material in materials
         ),
         "material{s} with an alphaMode that glTF does not have: opaque": (
-            material.alphaMode not in ("OPAQUE", *CUT_OUTS) for material in materials
+            material.alphaMode not in ("OPAQUE", *TRANSPARENT_MODES)
+            for material in materials
         ),
         "further scene{s}: left out": (True for _ in header.scenes[1:]),
         "node{s} with a mesh outside of its scene: left out": (
@@ -117,12 +134,12 @@ def left_out(header: Header, notes: Notes) -> None:
             if index not in in_scene
         ),
     }
-    for sentence in _counts(kinds):
-        notes.say(sentence)
+    for sentence in _count_phrases(kinds):
+        notes.warn(sentence)
     _note_unread(header, notes)
 
 
-WORDS = {
+ENTRY_KINDS = {
     "Header": "entry",
     **dict.fromkeys(("MaterialEntry", "MetallicRoughness"), "entry of a material"),
     **dict.fromkeys(("TextureUse", "NormalUse"), "entry of a material's texture"),
@@ -138,7 +155,7 @@ WORDS = {
     **{"TextureTransform": "entry of KHR_texture_transform"},
 }
 """Kind, for notes, of the keys left out of each type of entry."""
-PLAIN = frozenset(("name", "weights", "extensions"))
+IGNORED_KEYS = frozenset(("name", "weights", "extensions"))
 """Keys without a field that need no note: they change nothing, or another note covers
 them.
 """
@@ -146,27 +163,27 @@ them.
 
 def _note_unread(header: Header, notes: Notes) -> None:
     """Note the keys of entries, and the attributes of primitives, that are not read."""
-    for entry in header.entries():
-        kind = WORDS.get(type(entry).__name__)
+    for entry in header.iterate_entries():
+        kind = ENTRY_KINDS.get(type(entry).__name__)
         if kind is None:
             continue
         keys = TrackedKeys(
             {**(entry.model_extra or {}), "extensions": entry.extensions}
         )
-        extensions = keys.nested("extensions")
-        for name, read_keys in entry.read_of_extensions().items():
-            extension = extensions.nested(name)
+        extensions = keys.get_nested("extensions")
+        for name, read_keys in entry.list_extension_keys().items():
+            extension = extensions.get_nested(name)
             all_keys = [key for key, _ in extension.items()]
             extension.mark_read(*(read_keys or all_keys))
         # Extensions that are not understood are noted once for the file.
         extensions.mark_read(*(name for name, _ in extensions.items()))
-        for key in keys.unread():
-            notes.has(kind, key)
-    for kind in set(WORDS.values()):
+        for key in keys.find_unread():
+            notes.record(kind, key)
+    for kind in set(ENTRY_KINDS.values()):
         is_of_material = "material" in kind or "texture" in kind
         # Elsewhere, extras are notes of applications.
-        for key in PLAIN if is_of_material else {*PLAIN, "extras"}:
-            notes.take(kind, key)
+        for key in IGNORED_KEYS if is_of_material else {*IGNORED_KEYS, "extras"}:
+            notes.mark_read(kind, key)
     for mesh in header.meshes:
         for primitive in mesh.primitives:
             _note_unread_attributes(header, primitive, notes)
@@ -177,17 +194,17 @@ def _note_unread_attributes(header: Header, primitive: Primitive, notes: Notes) 
     read = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0"}
     if primitive.material is not None:
         material = header.materials[primitive.material]
-        read.add(material.attribute)
+        read.add(material.uv_attribute)
         packed = material.surface.metallicRoughnessTexture
         if packed is not None:
-            read.add(packed.attribute)
+            read.add(packed.uv_attribute)
     for name in primitive.attributes:
         is_of_skin = header.skins and name.startswith(("JOINTS_", "WEIGHTS_"))
-        if name not in read and not is_of_skin and not is_of_splats(name):
-            notes.has("attribute", name)
+        if name not in read and not is_of_skin and not is_splat_name(name):
+            notes.record("attribute", name)
 
 
-def beside(header: Header, file: str) -> list[str]:
+def describe_left_out(header: Header, file: str) -> list[str]:
     """Describe the lights and cameras that a file read as one object leaves out.
 
     Returns:
@@ -195,7 +212,7 @@ def beside(header: Header, file: str) -> list[str]:
     """
     has_light = [node.lamp is not None for node in header.nodes]
     has_camera = [node.camera is not None for node in header.nodes]
-    counts = _counts({"light{s}": has_light, "camera{s}": has_camera})
+    counts = _count_phrases({"light{s}": has_light, "camera{s}": has_camera})
     if not counts:
         return []
     verb = "is" if sum(has_light) + sum(has_camera) == 1 else "are"
@@ -203,9 +220,9 @@ def beside(header: Header, file: str) -> list[str]:
     return [f"{file}: {' and '.join(counts)} {verb} left out of the object; {advice}"]
 
 
-def lights_and_cameras(header: Header, file: str) -> list[str]:
+def describe_changed_lights(header: Header, file: str) -> list[str]:
     """Describe the lights and cameras of a file that are imported as something else."""
-    directional = f"directional light{{s}}, here as lamps {FAR:g} object sizes away"
+    directional = f"directional light{{s}}, here as lamps {DIRECTIONAL_LIGHT_DISTANCE:g} object sizes away"
     ranged = "light{s} with a range, which is left out: light reaches beyond it"
     kinds = {
         directional: (light.type == "directional" for light in header.lights),
@@ -214,10 +231,10 @@ def lights_and_cameras(header: Header, file: str) -> list[str]:
             camera.perspective is None for camera in header.cameras
         ),
     }
-    return [f"{file}: {sentence}" for sentence in _counts(kinds)]
+    return [f"{file}: {sentence}" for sentence in _count_phrases(kinds)]
 
 
-def _counts(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
+def _count_phrases(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
     """Return one phrase with a count for each kind of thing that is there at all.
 
     Args:
@@ -235,13 +252,15 @@ def _counts(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
 
 
 # How far texture coordinates may lie outside [0, 1] before the wrap mode matters.
-BEYOND = 1e-4
-SMALL = 256  # texels of a side up to which half a texel at an edge is visible
-EDGES = (
+WRAP_TOLERANCE = 1e-4
+SMALL_IMAGE_SIZE = (
+    256  # texels of a side up to which half a texel at an edge is visible
+)
+EDGES_NOTE = (
     " has textures that do not repeat beyond their edges; where they differ, or "
     "reach far, they do here"
 )
-BLURRED = (
+BLURRED_NOTE = (
     " has textures with sharp texels (filter NEAREST); those above {most} "
     "texels "
     "a side are filtered"
@@ -254,22 +273,22 @@ class GltfSurfaces:
 
     file: GltfFile
     notes: Notes  # about the file
-    # Longest side of a texture; None: as `FilePictures` limits those of an object.
+    # Longest side of a texture; None: as `FileImages` limits those of an object.
     texture_limit: int | None = None
 
     def __post_init__(self) -> None:
         materials = len(self.file.header.materials)
-        self._pictures = FilePictures(
+        self._pictures = FileImages(
             materials, self.file.references, self.notes, self.texture_limit
         )
 
-    def surface(
-        self, number: int | None, pieces: Sequence[Piece]
-    ) -> tuple[ImportedSurface, Doubles, Doubles]:
+    def make_surface(
+        self, material_index: int | None, pieces: Sequence[PrimitiveData]
+    ) -> tuple[ImportedSurface, Float64Array, Float64Array]:
         """Convert one material.
 
         Args:
-            number: index of the material; None is the format's default.
+            material_index: index of the material; None is the format's default.
             pieces: all primitives with the material, with texture coordinates as the
                 format has them.
 
@@ -279,26 +298,26 @@ class GltfSurfaces:
         """
         material = MaterialEntry()
         name = ""
-        if number is not None:
-            material = self.file.header.materials[number]
-            name = material.name or f"material {number}"
-        color, texture = self._base_color(material)
-        roughness, metallic = self._roughness_and_metallic(material, pieces)
+        if material_index is not None:
+            material = self.file.header.materials[material_index]
+            name = material.name or f"material {material_index}"
+        color, texture = self._make_base_color(material)
+        roughness, metallic = self._compute_roughness_and_metallic(material, pieces)
         surface = ImportedSurface(
             color,
             texture,
-            unit(roughness),
-            unit(metallic),
-            self._normals(material),
-            self._emission(material),
+            clip_to_unit(roughness),
+            clip_to_unit(metallic),
+            self._make_normal_map(material),
+            self._make_emission(material),
             name,
         )
         uvs = [piece.part.uvs for piece in pieces if piece.part.uvs is not None]
-        return self._fitted(surface, material, uvs)
+        return self._fit_images(surface, material, uvs)
 
-    def _base_color(
+    def _make_base_color(
         self, material: MaterialEntry
-    ) -> tuple[Floats | None, Floats | None]:
+    ) -> tuple[Float32Array | None, Float32Array | None]:
         """Return the base color (3 or 4,) and its texture (H, W, 3 or 4), in sRGB."""
         entry = material.surface
         stated_factor = entry.baseColorFactor
@@ -306,12 +325,12 @@ class GltfSurfaces:
             stated_factor = [1.0] * 4
         factor = np.array(stated_factor, np.float32).clip(0, 1)
         color_factor = factor[:3]
-        has_alpha = material.alphaMode in CUT_OUTS
+        has_alpha = material.alphaMode in TRANSPARENT_MODES
         color = linear_to_srgb(color_factor)
-        texture = self._picture(
+        texture = self._load_image(
             entry.baseColorTexture,
             "colours and alpha" if has_alpha else "colours",
-            f" names the texture {{name}}, which {{why}}; {instead_of_texture(color)} "
+            f" names the texture {{name}}, which {{why}}; {describe_substitute(color)} "
             "is used instead",
         )
         if texture is not None and (color_factor != 1.0).any():
@@ -319,26 +338,26 @@ class GltfSurfaces:
             texture = np.concatenate(
                 [linear_to_srgb(linear), texture[:, :, 3:]], axis=2
             )
-        base_color: Floats | None = color
+        base_color: Float32Array | None = color
         if entry.baseColorTexture is not None and (color > 0.999).all():
             base_color = None  # plain white does not change a texture
         if has_alpha:
             cutoff = None if material.alphaMode == "BLEND" else material.alphaCutoff
-            base_color = with_opacity(base_color, factor[3:], cutoff)
-            texture = with_opacity(texture, factor[3:], cutoff)
+            base_color = apply_opacity(base_color, factor[3:], cutoff)
+            texture = apply_opacity(texture, factor[3:], cutoff)
         return base_color, texture
 
-    def _normals(self, material: MaterialEntry) -> Floats | None:
+    def _make_normal_map(self, material: MaterialEntry) -> Float32Array | None:
         """Return the normal map (H, W, 3) of a material, or None."""
         use = material.normalTexture
-        if use is None or not material.reads(use):
+        if use is None or not material.can_read(use):
             return None
-        image = self._picture(
+        image = self._load_image(
             use, "numbers", "the normal map {name} {why}; it is left out"
         )
-        return None if image is None else normal_map(image, use.scale)
+        return None if image is None else make_normal_map(image, use.scale)
 
-    def _emission(self, material: MaterialEntry) -> Floats | None:
+    def _make_emission(self, material: MaterialEntry) -> Float32Array | None:
         """Return the radiance (H, W, 3) that a material emits, or None.
 
         Its unit is that of environments, as in Blender (section 3.9.3, and
@@ -346,17 +365,17 @@ class GltfSurfaces:
         """
         factor = np.array(material.emission)
         use = material.emissiveTexture
-        if not factor.any() or not material.reads(use):
+        if not factor.any() or not material.can_read(use):
             return None
-        image = self._picture(
+        image = self._load_image(
             use, "colours", "the texture {name} of the emission {why}; it is left out"
         )
         if use is not None and image is None:
             return None
-        return limited_radiance(factor, image, self.notes)
+        return compute_radiance(factor, image, self.notes)
 
-    def _roughness_and_metallic(
-        self, material: MaterialEntry, pieces: Sequence[Piece]
+    def _compute_roughness_and_metallic(
+        self, material: MaterialEntry, pieces: Sequence[PrimitiveData]
     ) -> tuple[float, float]:
         """Return roughness and metallic: the factors times the mean of their texture.
 
@@ -365,14 +384,16 @@ class GltfSurfaces:
         """
         entry = material.surface
         use = entry.metallicRoughnessTexture
-        image = self._picture(
+        image = self._load_image(
             use,
             "numbers",
             "the texture {name} of roughness and metallic {why}; it is left out",
         )
         if image is None or use is None:
             return entry.roughnessFactor, entry.metallicFactor
-        self.notes.say("textures of roughness and metallic are replaced by their means")
+        self.notes.warn(
+            "textures of roughness and metallic are replaced by their means"
+        )
         mapped = [
             (piece.part, piece.packed_uvs)
             for piece in pieces
@@ -383,14 +404,18 @@ class GltfSurfaces:
             corner_uvs = np.concatenate(
                 [uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped]
             )
-            vectors = face_vectors(
+            vectors = compute_area_vectors(
                 np.concatenate([part.vertices[part.faces] for part, _ in mapped])
             )
-            mean = mean_over(image, corner_uvs, np.linalg.norm(vectors, axis=1))
+            mean = average_over_faces(
+                image, corner_uvs, np.linalg.norm(vectors, axis=1)
+            )
         _, green, blue = mean.tolist()
         return entry.roughnessFactor * green, entry.metallicFactor * blue
 
-    def _picture(self, use: TextureUse | None, kind: Kind, words: str) -> Floats | None:
+    def _load_image(
+        self, use: TextureUse | None, kind: ImageKind, words: str
+    ) -> Float32Array | None:
         """Return the texels (H, W, C) of a texture; None, and a note, if it has none.
 
         A texture that is not to be filtered is enlarged by repeating its texels.
@@ -399,7 +424,7 @@ class GltfSurfaces:
             return None
         image_index = self.file.header.textures[use.index].image
         if image_index is None:
-            self._pictures.lacks(
+            self._pictures.note_missing(
                 "(embedded)", "has a picture of a kind that is not understood", words
             )
             return None
@@ -409,34 +434,37 @@ class GltfSurfaces:
 
         def load_content() -> bytes:
             if entry.uri is not None:
-                return self.file.uri(entry.uri)
+                return self.file.load_uri(entry.uri)
             if entry.bufferView is None:
                 return b""
-            return bytes(self.file.view(entry.bufferView))
+            return bytes(self.file.get_view(entry.bufferView))
 
-        texels = self._pictures.read(
+        texels = self._pictures.load(
             (entry.uri, entry.bufferView), load_content, kind, name, words
         )
-        is_sharp = self._sampler(use).magFilter == gltf_entries.NEAREST
+        is_sharp = self._get_sampler(use).magFilter == gltf_entries.NEAREST
         if texels is None or not is_sharp or texels.shape[:2] == (1, 1):
             return texels
         # At this size, filtering is not visible.
-        sharp_size = min(self._pictures.side, TEXTURE_LIMIT) // 2
+        sharp_size = min(self._pictures.max_side, TEXTURE_LIMIT) // 2
         repeats = sharp_size // max(texels.shape[:2])
         if repeats < 2:
-            self.notes.say(BLURRED.format(most=sharp_size // 2))
+            self.notes.warn(BLURRED_NOTE.format(most=sharp_size // 2))
             return texels
         return texels.repeat(repeats, axis=0).repeat(repeats, axis=1)
 
-    def _sampler(self, use: TextureUse) -> Sampler:
+    def _get_sampler(self, use: TextureUse) -> Sampler:
         sampler_index = self.file.header.textures[use.index].sampler
         if sampler_index is None:
             return Sampler()
         return self.file.header.samplers[sampler_index]
 
-    def _fitted(
-        self, surface: ImportedSurface, material: MaterialEntry, uvs: Sequence[Doubles]
-    ) -> tuple[ImportedSurface, Doubles, Doubles]:
+    def _fit_images(
+        self,
+        surface: ImportedSurface,
+        material: MaterialEntry,
+        uvs: Sequence[Float64Array],
+    ) -> tuple[ImportedSurface, Float64Array, Float64Array]:
         """Make the images of a surface behave under repetition as their wrap modes say.
 
         The renderer repeats all textures. Mirrored images are doubled, clamped ones and
@@ -455,11 +483,11 @@ class GltfSurfaces:
             material.emissiveTexture,
         )
         samplers = [
-            self._sampler(use)
+            self._get_sampler(use)
             for use in uses
-            if use is not None and material.reads(use)
+            if use is not None and material.can_read(use)
         ]
-        images = list(surface.pictures)
+        images = list(surface.images)
         if not images or not len(coordinates) or not np.isfinite(coordinates).all():
             return surface, scale, shift
         normals_index = None
@@ -477,16 +505,16 @@ class GltfSurfaces:
             images, scale[axis], shift[axis] = self._fit_axis(
                 images, 1 - axis, wraps, bounds, normals_index
             )
-        return surface.with_pictures(images), scale, shift
+        return surface.with_images(images), scale, shift
 
     def _fit_axis(
         self,
-        images: list[Floats],
+        images: list[Float32Array],
         axis: int,
         wraps: Sequence[int],
         bounds: tuple[float, float],
         normals_index: int | None,
-    ) -> tuple[list[Floats], float, float]:
+    ) -> tuple[list[Float32Array], float, float]:
         """Fit images (H, W, C) along one axis to the wrap mode of the first of them.
 
         Args:
@@ -499,13 +527,13 @@ class GltfSurfaces:
         Returns:
             The images, and scale and shift of texture coordinates.
         """
-        reaches_out = bounds[0] < -BEYOND or bounds[1] > 1.0 + BEYOND
+        reaches_out = bounds[0] < -WRAP_TOLERANCE or bounds[1] > 1.0 + WRAP_TOLERANCE
         edges_differ = any(_edges_differ(image, axis) for image in images)
         wrap = wraps[0]
         if reaches_out and len(set(wraps)) > 1:
-            self.notes.say(EDGES)
+            self.notes.warn(EDGES_NOTE)
         if wrap == gltf_entries.BORDER and reaches_out:
-            images = [_enlarged(image, axis) for image in images]
+            images = [_enlarge(image, axis) for image in images]
         if wrap == gltf_entries.MIRRORED and reaches_out:
             mirrored = [
                 np.concatenate([image, np.flip(image, axis)], axis=axis)
@@ -524,12 +552,12 @@ class GltfSurfaces:
 
     def _pad_images(
         self,
-        images: list[Floats],
+        images: list[Float32Array],
         axis: int,
         bounds: tuple[float, float],
         normals_index: int | None,
         has_border: bool,
-    ) -> tuple[list[Floats], float, float]:
+    ) -> tuple[list[Float32Array], float, float]:
         """Pad images along an axis as far as texture coordinates reach.
 
         Arguments and result are those of `_fit_axis`; `has_border` is whether pads are
@@ -542,14 +570,16 @@ class GltfSurfaces:
         before = max(0, int(np.ceil(-low * unit_size))) + 1
         after = max(0, int(np.ceil((high - 1.0) * unit_size))) + 1
         total = unit_size + before + after
-        if total * (max(sizes) // unit_size) > 2 * self._pictures.side:
-            self.notes.say(EDGES)
+        if total * (max(sizes) // unit_size) > 2 * self._pictures.max_side:
+            self.notes.warn(EDGES_NOTE)
             return images, 1.0, 0.0
         padded = []
         for index, image in enumerate(images):
             border = None
             if has_border:
-                border = FLAT if index == normals_index else np.zeros(1, np.float32)
+                border = (
+                    FLAT_TEXEL if index == normals_index else np.zeros(1, np.float32)
+                )
             texels_per_unit = sizes[index] // unit_size
             padded.append(
                 _pad(
@@ -563,19 +593,19 @@ class GltfSurfaces:
         return padded, unit_size / total, before / total
 
 
-def _edges_differ(image: Floats, axis: int) -> bool:
+def _edges_differ(image: Float32Array, axis: int) -> bool:
     """Return whether a repeated image would blend visibly at its edges along an axis.
 
     Only in small images half a texel at an edge is visible.
     """
-    if image.shape[axis] > SMALL:
+    if image.shape[axis] > SMALL_IMAGE_SIZE:
         return False
     return not np.array_equal(np.take(image, 0, axis), np.take(image, -1, axis))
 
 
 def _pad(
-    image: Floats, axis: int, before: int, after: int, border: Floats | None
-) -> Floats:
+    image: Float32Array, axis: int, before: int, after: int, border: Float32Array | None
+) -> Float32Array:
     """Pad an image along an axis by a number of texels before and after it.
 
     The pad has the value `border`, or repeats the texel at the edge if that is None.
@@ -591,13 +621,13 @@ def _pad(
     return padded
 
 
-def _enlarged(picture: Floats, axis: int) -> Floats:
-    """Enlarge an image to at least `SMALL` texels along an axis, interpolating linearly.
+def _enlarge(picture: Float32Array, axis: int) -> Float32Array:
+    """Enlarge an image to at least `SMALL_IMAGE_SIZE` texels along an axis, interpolating linearly.
 
     At that size a border of one texel is not visible.
     """
     size = picture.shape[axis]
-    times = -(-SMALL // size)
+    times = -(-SMALL_IMAGE_SIZE // size)
     if times == 1:
         return picture
     position = ((np.arange(size * times) + 0.5) / times - 0.5).clip(0.0, size - 1.0)
@@ -618,8 +648,10 @@ def _enlarged(picture: Floats, axis: int) -> Floats:
 TRIANGLES = 4
 STRIP = 5
 FAN = 6
-SEE_THROUGH = "mesh{es} with an opacity in vertex colours, which is left out"
-DEFAULT = (
+TRANSPARENT_COLORS_NOTE = (
+    "mesh{es} with an opacity in vertex colours, which is left out"
+)
+DEFAULT_MATERIAL_NOTE = (
     "mesh{es} without material: of white metal with roughness 1, the default of glTF"
 )
 
@@ -633,7 +665,7 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """
     file = GltfFile(path, data)
     header = file.header
-    poses = sorted(gltf_skeleton.poses(header), key=lambda item: item[0])
+    poses = sorted(gltf_skeleton.iterate_poses(header), key=lambda item: item[0])
     # Node, mesh and pose of everything that is drawn.
     instances = [
         (node, mesh, pose)
@@ -641,7 +673,7 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         if (mesh := header.nodes[node].mesh) is not None
     ]
     mesh_nodes = [node for node, _, _ in instances]
-    moving = gltf_skeleton.check_moving(file, mesh_nodes)
+    moving = gltf_skeleton.count_targets(file, mesh_nodes)
     pieces = _read_pieces(file, mesh_nodes)
     with_faces = {
         key: piece
@@ -649,12 +681,12 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         if piece is not None and len(piece.part.faces)
     }
     if not with_faces:
-        raise _no_faces(path, header, bool(pieces))
-    left_out(header, notes)
+        raise _make_no_faces_error(path, header, bool(pieces))
+    note_left_out(header, notes)
     _note_pieces(header, list(pieces), with_faces, notes)
-    parts_by_key = _surfaced_parts(GltfSurfaces(file, notes), with_faces)
+    parts_by_key = _make_parts(GltfSurfaces(file, notes), with_faces)
     skins = _read_skins(file, mesh_nodes)
-    skeleton = gltf_skeleton.skeleton_of(file, moving)
+    skeleton = gltf_skeleton.read_skeleton(file, moving)
     if skeleton is not None:
         _note_skeleton(skeleton, notes)
 
@@ -669,18 +701,20 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
             piece = with_faces[key]
             part = parts_by_key[key]
             if skeleton is not None:
-                part = _movable_part(file, part, piece, node, skin, skeleton)
-            if skin is None or piece.bound is None:
-                part = placed(part, pose)
+                part = _make_movable(file, part, piece, node, skin, skeleton)
+            if skin is None or piece.vertex_joints is None:
+                part = transform_part(part, pose)
             else:
                 _, _, matrices = skin
-                part = gltf_skeleton.posed(path, part, piece.bound, matrices)
+                part = gltf_skeleton.pose_part(
+                    path, part, piece.vertex_joints, matrices
+                )
             parts.append(replace(part, node=node))
     check_faces(path, sum(len(part.faces) for part in parts))
     return parts
 
 
-SkinPose = tuple[Ints, Doubles, Doubles]
+SkinPose = tuple[IntArray, Float64Array, Float64Array]
 """A skin at rest: its joints (J,), which are nodes; its inverse bind matrices (J, 4, 4),
 from the mesh to each joint; and the matrices (J, 4, 4) from the mesh to the scene.
 """
@@ -688,7 +722,7 @@ from the mesh to each joint; and the matrices (J, 4, 4) from the mesh to the sce
 
 def _read_pieces(
     file: GltfFile, mesh_nodes: Sequence[int]
-) -> dict[tuple[int, int], Piece | None]:
+) -> dict[tuple[int, int], PrimitiveData | None]:
     """Read the primitives that some nodes draw, by mesh and index in the mesh."""
     header = file.header
     meshes = dict.fromkeys(header.nodes[node].mesh for node in mesh_nodes)
@@ -697,23 +731,25 @@ def _read_pieces(
         for node in mesh_nodes
         if header.nodes[node].skin is not None
     }
-    pieces = dict[tuple[int, int], Piece | None]()
+    pieces = dict[tuple[int, int], PrimitiveData | None]()
     for mesh in meshes:
         assert mesh is not None
         entry = header.meshes[mesh]
         for index, primitive in enumerate(entry.primitives):
-            pieces[mesh, index] = read_piece(
+            pieces[mesh, index] = read_primitive(
                 file, primitive, entry.extras, mesh in skinned_meshes
             )
     return pieces
 
 
-def _no_faces(path: Path, header: Header, has_primitives: bool) -> FileFormatError:
+def _make_no_faces_error(
+    path: Path, header: Header, has_primitives: bool
+) -> FileFormatError:
     """Return the error for a file without any face."""
-    if any(map(is_of_splats, header.extensionsUsed)):
+    if any(map(is_splat_name, header.extensionsUsed)):
         return FileFormatError(
             f"{path}: expected a mesh with faces, got Gaussian "
-            f"splats, a model that {SPLATS}"
+            f"splats, a model that {SPLATS_ADVICE}"
         )
     got = "points or lines only" if has_primitives else "none"
     return FileFormatError(
@@ -724,34 +760,42 @@ def _no_faces(path: Path, header: Header, has_primitives: bool) -> FileFormatErr
 def _note_pieces(
     header: Header,
     keys: Sequence[tuple[int, int]],
-    with_faces: Mapping[tuple[int, int], Piece],
+    with_faces: Mapping[tuple[int, int], PrimitiveData],
     notes: Notes,
 ) -> None:
     """Note primitives without faces or material, and with transparent vertices."""
     primitives = [header.meshes[mesh].primitives[index] for mesh, index in keys]
     n_splats = sum(
-        any(map(is_of_splats, unread_extensions(primitive))) for primitive in primitives
+        any(map(is_splat_name, find_unread_extensions(primitive)))
+        for primitive in primitives
     )
     n_without_faces = len(keys) - len(with_faces) - n_splats
     if n_without_faces:
-        notes.say(f"{n_without_faces} parts without faces (points, lines) are left out")
-    transparent = {mesh for (mesh, _), piece in with_faces.items() if piece.see_through}
+        notes.warn(
+            f"{n_without_faces} parts without faces (points, lines) are left out"
+        )
+    transparent = {
+        mesh for (mesh, _), piece in with_faces.items() if piece.has_transparent_colors
+    }
     bare = {mesh for (mesh, _), piece in with_faces.items() if piece.material is None}
-    kinds = {SEE_THROUGH: [True] * len(transparent), DEFAULT: [True] * len(bare)}
-    for sentence in _counts(kinds):
-        notes.say(sentence)
+    kinds = {
+        TRANSPARENT_COLORS_NOTE: [True] * len(transparent),
+        DEFAULT_MATERIAL_NOTE: [True] * len(bare),
+    }
+    for sentence in _count_phrases(kinds):
+        notes.warn(sentence)
 
 
-def _surfaced_parts(
-    surfaces: GltfSurfaces, with_faces: Mapping[tuple[int, int], Piece]
+def _make_parts(
+    surfaces: GltfSurfaces, with_faces: Mapping[tuple[int, int], PrimitiveData]
 ) -> dict[tuple[int, int], ImportedPart]:
     """Return the parts of pieces with their surfaces and final UVs."""
-    groups = dict[int | None, dict[tuple[int, int], Piece]]()
+    groups = dict[int | None, dict[tuple[int, int], PrimitiveData]]()
     for key, piece in with_faces.items():
         groups.setdefault(piece.material, {})[key] = piece
     parts = dict[tuple[int, int], ImportedPart]()
     for material, group in groups.items():
-        surface, scale, shift = surfaces.surface(material, list(group.values()))
+        surface, scale, shift = surfaces.make_surface(material, list(group.values()))
         for key, piece in group.items():
             uvs = piece.part.uvs
             if uvs is not None:
@@ -765,13 +809,15 @@ def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose
     """Return the skins of some nodes by index."""
     header = file.header
     # Joints may be outside of the scene that is shown.
-    all_poses = dict(gltf_skeleton.poses(header.model_copy(update={"scenes": []})))
+    all_poses = dict(
+        gltf_skeleton.iterate_poses(header.model_copy(update={"scenes": []}))
+    )
     skins = dict[int, SkinPose]()
     for index in {header.nodes[node].skin for node in mesh_nodes}:
         if index is None:
             continue
         joints = header.skins[index].joints
-        inverse = gltf_skeleton.inverse_binds(file, header.skins[index])
+        inverse = gltf_skeleton.read_inverse_binds(file, header.skins[index])
         matrices = np.stack([all_poses[joint] for joint in joints]) @ inverse
         skins[index] = (np.array(joints), inverse, matrices)
     return skins
@@ -783,13 +829,13 @@ def _note_skeleton(skeleton: Skeleton, notes: Notes) -> None:
     if names:
         more = ", ..." if len(names) > 5 else ""
         clips = f", and plays {', '.join(names[:5])}{more}"
-    notes.say(f" is shown at rest: the control body moves it{clips}")
+    notes.warn(f" is shown at rest: the control body moves it{clips}")
 
 
-def _movable_part(
+def _make_movable(
     file: GltfFile,
     part: ImportedPart,
-    piece: Piece,
+    piece: PrimitiveData,
     node: int,
     skin: SkinPose | None,
     skeleton: Skeleton,
@@ -797,13 +843,13 @@ def _movable_part(
     """Return a part with its morph targets at rest, and with what moves it."""
     # Without a skin, all vertices are bound to the node itself.
     joints = np.zeros((len(part.vertices), 1), np.int64)
-    bound = gltf_skeleton.Bound(joints, np.ones(joints.shape))
+    bound = gltf_skeleton.VertexJoints(joints, np.ones(joints.shape))
     nodes = np.array([node])
     inverse_binds = np.eye(4)[None]
-    if skin is not None and piece.bound is not None:
-        bound = piece.bound
+    if skin is not None and piece.vertex_joints is not None:
+        bound = piece.vertex_joints
         nodes, inverse_binds, _ = skin
-    rest = gltf_skeleton.weights_of(file, node, len(piece.targets))
+    rest = gltf_skeleton.read_rest_weights(file, node, len(piece.targets))
     movable = Movable(
         skeleton,
         node,
@@ -814,11 +860,13 @@ def _movable_part(
         piece.targets,
         rest,
     )
-    morphed = gltf_skeleton.morphed(part, piece.targets, piece.turns, rest)
+    morphed = gltf_skeleton.apply_targets(
+        part, piece.targets, piece.normal_offsets, rest
+    )
     return replace(morphed, movable=movable)
 
 
-class Piece(NamedTuple):
+class PrimitiveData(NamedTuple):
     """A primitive as the file stores it, without surface.
 
     Texture coordinates are the format's, with v = 0 at the top.
@@ -826,23 +874,25 @@ class Piece(NamedTuple):
 
     part: ImportedPart  # its geometry
     material: int | None  # index
-    see_through: bool  # whether it has vertex colors whose alpha would count
-    bound: gltf_skeleton.Bound | None  # joints and weights
-    targets: tuple[Target, ...]  # morph targets
-    turns: tuple[Doubles | None, ...]  # what each target adds to its normals
-    packed_uvs: Doubles | None  # (V, 2) of its texture of roughness and metallic
+    has_transparent_colors: bool  # whether it has vertex colors whose alpha would count
+    vertex_joints: gltf_skeleton.VertexJoints | None  # joints and weights
+    targets: tuple[MorphTarget, ...]  # morph targets
+    normal_offsets: tuple[
+        Float64Array | None, ...
+    ]  # what each target adds to its normals
+    packed_uvs: Float64Array | None  # (V, 2) of its texture of roughness and metallic
 
 
-def read_piece(
-    file: GltfFile, primitive: Primitive, extras: object, skinned: bool
-) -> Piece | None:
+def read_primitive(
+    file: GltfFile, primitive: Primitive, extras: object, is_skinned: bool
+) -> PrimitiveData | None:
     """Read one primitive; None if it is points or lines, or has no positions.
 
     Args:
         file: the glTF file.
         primitive: its entry in the header.
         extras: those of its mesh.
-        skinned: whether a node with a skin draws it.
+        is_skinned: whether a node with a skin draws it.
 
     Raises:
         FileFormatError: a face refers to a vertex that is not there.
@@ -852,37 +902,39 @@ def read_piece(
     if primitive.mode < TRIANGLES or "POSITION" not in attributes:
         return None
     used, faces = _used_vertices(file, primitive)
-    vertices = file.numbers(attributes["POSITION"], used)
+    vertices = file.read_numbers(attributes["POSITION"], used)
     material = MaterialEntry()
     if primitive.material is not None:
         material = header.materials[primitive.material]
-    uvs = _coordinates(file, attributes, material.layout, used)
+    uvs = _read_texture_coordinates(file, attributes, material.layout_texture, used)
     packed = material.surface.metallicRoughnessTexture
     packed_uvs = None
     if packed is not None:
-        packed_uvs = _coordinates(file, attributes, packed, used)
+        packed_uvs = _read_texture_coordinates(file, attributes, packed, used)
     colors = None
     see_through = False
     if "COLOR_0" in attributes:
-        rgba = file.numbers(attributes["COLOR_0"], used)
+        rgba = file.read_numbers(attributes["COLOR_0"], used)
         rgba = np.clip(np.nan_to_num(rgba), 0.0, 1.0)
         colors = rgba[:, :3][faces]
         has_alpha = rgba.shape[1] == 4 and bool((rgba[:, 3] < 1.0).any())
-        see_through = material.alphaMode in CUT_OUTS and has_alpha
+        see_through = material.alphaMode in TRANSPARENT_MODES and has_alpha
     normals = None
     if "NORMAL" in attributes:
-        normals = file.numbers(attributes["NORMAL"], used)
+        normals = file.read_numbers(attributes["NORMAL"], used)
     part = ImportedPart(
         vertices, faces, normals, uvs, colors, ImportedSurface(), flat=True
     )
-    bound = gltf_skeleton.bound(file, primitive, used) if skinned else None
-    targets, turns = gltf_skeleton.targets_of(file, primitive, used, extras)
-    return Piece(
+    bound = (
+        gltf_skeleton.read_vertex_joints(file, primitive, used) if is_skinned else None
+    )
+    targets, turns = gltf_skeleton.read_targets(file, primitive, used, extras)
+    return PrimitiveData(
         part, primitive.material, see_through, bound, targets, turns, packed_uvs
     )
 
 
-def _used_vertices(file: GltfFile, primitive: Primitive) -> tuple[Ints, Ints]:
+def _used_vertices(file: GltfFile, primitive: Primitive) -> tuple[IntArray, IntArray]:
     """Return the vertices (V,) that the faces of a primitive have, and the faces.
 
     Primitives may share accessors, so not every vertex is used. Faces (F, 3) are
@@ -891,35 +943,37 @@ def _used_vertices(file: GltfFile, primitive: Primitive) -> tuple[Ints, Ints]:
     count = file.header.accessors[primitive.attributes["POSITION"]].count
     order = np.arange(count)
     if primitive.indices is not None:
-        order = file.values(primitive.indices)[:, 0].astype(np.int64)
+        order = file.read_values(primitive.indices)[:, 0].astype(np.int64)
     if len(order) and order.max() >= count:
         raise damaged(
             file.path,
             "faces of its own vertices",
             "a face that refers to a vertex that is not there",
         )
-    used, corners = np.unique(_triangles(order, primitive.mode), return_inverse=True)
+    used, corners = np.unique(
+        _make_triangles(order, primitive.mode), return_inverse=True
+    )
     return used, corners.reshape(-1, 3).astype(np.int64)
 
 
-def _coordinates(
+def _read_texture_coordinates(
     file: GltfFile,
     attributes: Mapping[str, int],
     use: TextureUse | None,
-    used: Ints,
-) -> Doubles | None:
+    used: IntArray,
+) -> Float64Array | None:
     """Return the texture coordinates of used vertices, or None if there are none.
 
     They are (N, 2) after the texture's transform, (0, 0) at its top left corner.
     """
-    name = "TEXCOORD_0" if use is None else use.attribute
+    name = "TEXCOORD_0" if use is None else use.uv_attribute
     if name not in attributes:
         return None
     accessor = file.header.accessors[attributes[name]]
     vertex_count = file.header.accessors[attributes["POSITION"]].count
     if accessor.type != "VEC2" or accessor.count != vertex_count:
         return None  # those of the base color are checked with the header
-    uvs = file.numbers(attributes[name], used)
+    uvs = file.read_numbers(attributes[name], used)
     if use is None:
         return uvs
     transform = use.transform
@@ -930,7 +984,7 @@ def _coordinates(
     return np.asarray(rotated + transform.offset)
 
 
-def _triangles(order: Ints, mode: int) -> Ints:
+def _make_triangles(order: IntArray, mode: int) -> IntArray:
     """Return the faces (F, 3) of a primitive of a mode (section 3.7.2.1).
 
     `order` are its vertices in the order in which it lists them.

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles, Ints
-from advsearch.scene.importing.files import Names, clean, damaged
+from advsearch.scene.assets import Float64Array, IntArray
+from advsearch.scene.importing.files import UniqueNames, damaged, sanitize_name
 from advsearch.scene.importing.gltf import GltfFile
 from advsearch.scene.importing.gltf_entries import (
     Accessor,
@@ -21,34 +21,34 @@ from advsearch.scene.importing.gltf_entries import (
     Primitive,
     Skin,
 )
-from advsearch.scene.importing.parts import ImportedPart, put
+from advsearch.scene.importing.parts import ImportedPart, replace_geometry
 from advsearch.scene.skeleton import (
     Clip,
+    MorphTarget,
     Skeleton,
-    Target,
     Track,
-    entries_of_turn,
-    with_above,
+    rotation_entries,
+    with_ancestors,
 )
 from advsearch.trust.stored_files import check_most
 
-MOST_SETS = 8  # limit of the sets of four joints of a vertex
-MOST_KEYS = 1 << 24
+MAX_JOINT_SETS = 8  # limit of the sets of four joints of a vertex
+MAX_KEY_NUMBERS = 1 << 24
 """Limit of the numbers in the keys of all clips, before `scaled`; many keys may share one
 accessor.
 """
-MOST_MOVES = 1 << 25
+MAX_MOVES = 1 << 25
 """Limit of the vertices that all morph targets move, plus the inverse bind matrices;
 before `scaled`.
 """
-WIDTHS = {"translation": 3, "rotation": 4, "scale": 3, "weights": 1}
+VALUE_WIDTHS = {"translation": 3, "rotation": 4, "scale": 3, "weights": 1}
 """Numbers in a value of each property that a channel may set; of `weights`, for each
 morph target.
 """
-SHORTEST = 1e-6  # minimum length of a quaternion; the format requires 1
+MIN_QUATERNION_LENGTH = 1e-6  # minimum length of a quaternion; the format requires 1
 
 
-def poses(header: Header) -> Iterator[tuple[int, Doubles]]:
+def iterate_poses(header: Header) -> Iterator[tuple[int, Float64Array]]:
     """Yield the nodes of the file's scene with their poses (4, 4) in it."""
     if header.scenes:
         roots = list(header.scenes[header.scene or 0].nodes)
@@ -58,19 +58,19 @@ def poses(header: Header) -> Iterator[tuple[int, Doubles]]:
     stack = [(index, np.eye(4)) for index in roots]
     while stack:
         index, parent_pose = stack.pop()
-        pose = parent_pose @ matrix_of(header.nodes[index])
+        pose = parent_pose @ compute_matrix(header.nodes[index])
         yield index, pose
         stack.extend((child, pose) for child in header.nodes[index].children)
 
 
-def matrix_of(node: Node) -> Doubles:
+def compute_matrix(node: Node) -> Float64Array:
     """Return the matrix (4, 4) from a node to its parent."""
     if node.matrix is not None:
         return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)
     matrix = np.eye(4)
     length = max(float(np.linalg.norm(node.rotation or 1.0)), 1e-12)
     quaternion = np.array(node.rotation or [0.0, 0.0, 0.0, 1.0]) / length
-    rotation = np.reshape(entries_of_turn(*quaternion), (3, 3))
+    rotation = np.reshape(rotation_entries(*quaternion), (3, 3))
     matrix[:3, :3] = rotation * np.array(node.scale or [1.0, 1.0, 1.0])
     matrix[:3, 3] = node.translation or [0.0, 0.0, 0.0]
     return matrix
@@ -79,14 +79,16 @@ def matrix_of(node: Node) -> Doubles:
 # ---- Skins (section 3.7.3) ----
 
 
-class Bound(NamedTuple):
+class VertexJoints(NamedTuple):
     """The joints to which vertices are bound, and their weights."""
 
-    joints: Ints  # (V, 4 n) indices into the joints of the skin
-    weights: Doubles  # (V, 4 n); those of a vertex sum to 1
+    joints: IntArray  # (V, 4 n) indices into the joints of the skin
+    weights: Float64Array  # (V, 4 n); those of a vertex sum to 1
 
 
-def bound(file: GltfFile, primitive: Primitive, used: Ints) -> Bound | None:
+def read_vertex_joints(
+    file: GltfFile, primitive: Primitive, used: IntArray
+) -> VertexJoints | None:
     """Return the joints of the used vertices of a primitive; None if it has none.
 
     Raises:
@@ -94,12 +96,12 @@ def bound(file: GltfFile, primitive: Primitive, used: Ints) -> Bound | None:
     """
     attributes = primitive.attributes
     accessors = file.header.accessors
-    joints = list[Ints]()
-    weights = list[Doubles]()
+    joints = list[IntArray]()
+    weights = list[Float64Array]()
     while f"JOINTS_{len(joints)}" in attributes:
-        if len(joints) == MOST_SETS:
+        if len(joints) == MAX_JOINT_SETS:
             raise damaged(
-                file.path, f"at most {4 * MOST_SETS} joints of each vertex", "more"
+                file.path, f"at most {4 * MAX_JOINT_SETS} joints of each vertex", "more"
             )
         joints_index = attributes[f"JOINTS_{len(joints)}"]
         weights_index = attributes.get(f"WEIGHTS_{len(joints)}")
@@ -112,8 +114,8 @@ def bound(file: GltfFile, primitive: Primitive, used: Ints) -> Bound | None:
             raise damaged(
                 file.path, "four joints and four weights of each vertex", "others"
             )
-        joints.append(file.values(joints_index)[used].astype(np.int64))
-        weights.append(file.numbers(weights_index, used))
+        joints.append(file.read_values(joints_index)[used].astype(np.int64))
+        weights.append(file.read_numbers(weights_index, used))
     if not joints:
         return None
     stored_weights = np.concatenate(weights, axis=1)
@@ -124,14 +126,14 @@ def bound(file: GltfFile, primitive: Primitive, used: Ints) -> Bound | None:
         stored_weights / np.where(total > 0.0, total, 1.0),
         np.eye(1, stored_weights.shape[1]),
     )
-    return Bound(np.concatenate(joints, axis=1), normalized)
+    return VertexJoints(np.concatenate(joints, axis=1), normalized)
 
 
 def _is_vec4(accessor: Accessor, count: int) -> bool:
     return accessor.type == "VEC4" and accessor.count == count
 
 
-def inverse_binds(file: GltfFile, skin: Skin) -> Doubles:
+def read_inverse_binds(file: GltfFile, skin: Skin) -> Float64Array:
     """Return the inverse bind matrices (J, 4, 4), from the mesh to each joint.
 
     Raises:
@@ -140,7 +142,7 @@ def inverse_binds(file: GltfFile, skin: Skin) -> Doubles:
     count = len(skin.joints)
     if skin.inverseBindMatrices is None:
         return np.tile(np.eye(4), (count, 1, 1))
-    values = file.values(skin.inverseBindMatrices)
+    values = file.read_values(skin.inverseBindMatrices)
     if values.shape[1:] != (16,) or len(values) < count:
         got = f"{len(values)} of {values.shape[1]} numbers"
         raise damaged(file.path, f"{count} inverse bind matrices of 4 x 4", got)
@@ -150,8 +152,8 @@ def inverse_binds(file: GltfFile, skin: Skin) -> Doubles:
     )
 
 
-def posed(
-    path: Path, part: ImportedPart, bound: Bound, matrices: Doubles
+def pose_part(
+    path: Path, part: ImportedPart, vertex_joints: VertexJoints, matrices: Float64Array
 ) -> ImportedPart:
     """Return a part as its joints pose it in the scene, by linear blend skinning.
 
@@ -160,21 +162,23 @@ def posed(
     Args:
         path: the file, for messages.
         part: a part in the coordinates of its mesh.
-        bound: the joints of its vertices.
+        vertex_joints: the joints of its vertices.
         matrices: (J, 4, 4) from the mesh to the scene, for each joint.
 
     Raises:
         FileFormatError: it is bound to joints that its skin does not have.
     """
-    max_joint = bound.joints.max(initial=0)
-    if max_joint >= len(matrices) or bound.joints.min(initial=0) < 0:
+    max_joint = vertex_joints.joints.max(initial=0)
+    if max_joint >= len(matrices) or vertex_joints.joints.min(initial=0) < 0:
         raise damaged(
             path,
             f"joints under {len(matrices)}, as its skin has",
-            f"number {int(bound.joints.max())}",
+            f"number {int(vertex_joints.joints.max())}",
         )
     transforms = np.zeros((len(part.vertices), 3, 4))
-    for joint, weight in zip(bound.joints.T, bound.weights.T, strict=True):
+    for joint, weight in zip(
+        vertex_joints.joints.T, vertex_joints.weights.T, strict=True
+    ):
         transforms += weight[:, None, None] * matrices[joint, :3]
     linear = transforms[:, :, :3]
     normals = part.normals
@@ -184,12 +188,12 @@ def posed(
         cofactors = np.cross(linear[:, [1, 2, 0]], linear[:, [2, 0, 1]])
         normals = np.einsum("vij,vj->vi", cofactors, normals)
     is_mirrored = bool((np.linalg.det(linear) < 0.0).all())
-    return put(part, vertices, normals, mirrored=is_mirrored)
+    return replace_geometry(part, vertices, normals, is_mirrored=is_mirrored)
 
 
-def targets_of(
-    file: GltfFile, primitive: Primitive, used: Ints, extras: object
-) -> tuple[tuple[Target, ...], tuple[Doubles | None, ...]]:
+def read_targets(
+    file: GltfFile, primitive: Primitive, used: IntArray, extras: object
+) -> tuple[tuple[MorphTarget, ...], tuple[Float64Array | None, ...]]:
     """Read the morph targets of a primitive.
 
     Args:
@@ -207,8 +211,8 @@ def targets_of(
     names = extras.get("targetNames") if isinstance(extras, dict) else None
     if not isinstance(names, list):
         names = []
-    targets = list[Target]()
-    normal_offsets = list[Doubles | None]()
+    targets = list[MorphTarget]()
+    normal_offsets = list[Float64Array | None]()
     for index, attributes in enumerate(primitive.targets):
         offsets = _read_offsets(file, primitive, attributes, "POSITION", used)
         if offsets is None:
@@ -217,7 +221,9 @@ def targets_of(
         name = f"target-{index}"
         if index < len(names) and isinstance(names[index], str):
             name = names[index]
-        targets.append(Target(clean(name), moved_rows, offsets[moved_rows]))
+        targets.append(
+            MorphTarget(sanitize_name(name), moved_rows, offsets[moved_rows])
+        )
         normal_offsets.append(
             _read_offsets(file, primitive, attributes, "NORMAL", used)
         )
@@ -229,8 +235,8 @@ def _read_offsets(
     primitive: Primitive,
     attributes: Mapping[str, int],
     name: str,
-    used: Ints,
-) -> Doubles | None:
+    used: IntArray,
+) -> Float64Array | None:
     """Return what a morph target adds to an attribute of used vertices, (V, 3)."""
     if name not in attributes:
         return None
@@ -243,37 +249,39 @@ def _read_offsets(
             f"a {name} of type VEC3 for each vertex in a morph target",
             "others",
         )
-    offsets = file.numbers(attributes[name], used)
-    return _finite(file.path, "morph targets", offsets)
+    offsets = file.read_numbers(attributes[name], used)
+    return _require_finite(file.path, "morph targets", offsets)
 
 
-def morphed(
+def apply_targets(
     part: ImportedPart,
-    targets: Sequence[Target],
-    turns: Sequence[Doubles | None],
-    weights: Doubles,
+    targets: Sequence[MorphTarget],
+    normal_offsets: Sequence[Float64Array | None],
+    weights: Float64Array,
 ) -> ImportedPart:
     """Return a part, in its mesh's coordinates, with morph targets applied.
 
     Args:
         part: a part as the file stores it.
         targets: its T morph targets.
-        turns: what each adds to the normals.
+        normal_offsets: what each adds to the normals.
         weights: (T,).
     """
     vertices = part.vertices
     normals = part.normals
-    for target, normal_offset, weight in zip(targets, turns, weights, strict=True):
+    for target, normal_offset, weight in zip(
+        targets, normal_offsets, weights, strict=True
+    ):
         if not weight:
             continue
         vertices = np.array(vertices)
-        vertices[target.rows] += weight * target.moves
+        vertices[target.rows] += weight * target.offsets
         if normals is not None and normal_offset is not None:
             normals = normals + weight * normal_offset
     return replace(part, vertices=vertices, normals=normals)
 
 
-def weights_of(file: GltfFile, node: int, count: int) -> Doubles:
+def read_rest_weights(file: GltfFile, node: int, count: int) -> Float64Array:
     """Return the weights (T,) at rest of a node's morph targets.
 
     Raises:
@@ -292,7 +300,7 @@ def weights_of(file: GltfFile, node: int, count: int) -> Doubles:
     return np.array(weights, np.float64)
 
 
-def check_moving(file: GltfFile, drawn: Sequence[int]) -> dict[int, int]:
+def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
     """Return the number of morph targets of each node with a mesh.
 
     Raises:
@@ -302,7 +310,7 @@ def check_moving(file: GltfFile, drawn: Sequence[int]) -> dict[int, int]:
     header = file.header
     n_targets = dict[int, int]()
     n_moves = 0
-    for node in drawn:
+    for node in mesh_nodes:
         entry = header.nodes[node]
         primitives: Sequence[Primitive] = ()
         if entry.mesh is not None:
@@ -326,33 +334,35 @@ def check_moving(file: GltfFile, drawn: Sequence[int]) -> dict[int, int]:
     check_most(
         file.path,
         n_moves,
-        MOST_MOVES,
+        MAX_MOVES,
         "morph targets and joints for at most {} vertices",
     )
     return n_targets
 
 
-def skeleton_of(file: GltfFile, drawn: Mapping[int, int]) -> Skeleton | None:
+def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton | None:
     """Return the nodes and clips of a file; None if nothing moves its geometry.
 
     Args:
         file: the glTF file.
-        drawn: the nodes with a mesh, and their number of morph targets.
+        target_counts: the nodes with a mesh, and their number of morph targets.
 
     Raises:
         FileFormatError: a clip is not as the format defines it, or clips are too large.
     """
     header = file.header
-    skins = {skin for node in drawn if (skin := header.nodes[node].skin) is not None}
-    clips = _read_clips(file, drawn, skins)
-    if not (skins or clips or any(drawn.values())):
+    skins = {
+        skin for node in target_counts if (skin := header.nodes[node].skin) is not None
+    }
+    clips = _read_clips(file, target_counts, skins)
+    if not (skins or clips or any(target_counts.values())):
         return None
     bone_names = {bone.node: bone.bone for bone in header.vrm_0} | {
         bone.node: name for name, bone in header.vrm.items()
     }
-    names = Names()
+    names = UniqueNames()
     node_names = [
-        names.free(bone_names.get(index) or node.name or f"node-{index}")
+        names.make_unique(bone_names.get(index) or node.name or f"node-{index}")
         for index, node in enumerate(header.nodes)
     ]
     rotations = np.array(
@@ -363,7 +373,7 @@ def skeleton_of(file: GltfFile, drawn: Mapping[int, int]) -> Skeleton | None:
         file.path.name,
         tuple(node_names),
         np.array(header.parents),
-        np.stack([matrix_of(node) for node in header.nodes]),
+        np.stack([compute_matrix(node) for node in header.nodes]),
         np.array([node.translation or [0.0] * 3 for node in header.nodes]),
         np.asarray(rotations / np.maximum(lengths, 1e-12)),
         np.array([node.scale or [1.0] * 3 for node in header.nodes]),
@@ -373,20 +383,20 @@ def skeleton_of(file: GltfFile, drawn: Mapping[int, int]) -> Skeleton | None:
 
 
 def _read_clips(
-    file: GltfFile, drawn: Mapping[int, int], skins: Collection[int]
+    file: GltfFile, target_counts: Mapping[int, int], skins: Collection[int]
 ) -> tuple[Clip, ...]:
     """Return the clips of a file, of which only what moves geometry is read."""
     header = file.header
     joints = {joint for skin in skins for joint in header.skins[skin].joints}
-    moving_nodes = with_above(header.parents, {*drawn, *joints})
+    moving_nodes = with_ancestors(header.parents, {*target_counts, *joints})
 
     def moves_geometry(channel: Channel) -> bool:
         node = channel.target.node
         path = channel.target.path
-        if node is None or path not in WIDTHS:  # it is of an extension
+        if node is None or path not in VALUE_WIDTHS:  # it is of an extension
             return False
         if path == "weights":
-            return drawn.get(node, 0) > 0
+            return target_counts.get(node, 0) > 0
         return node in moving_nodes
 
     used_channels = [
@@ -398,20 +408,26 @@ def _read_clips(
         for channel in channels:
             keys = header.accessors[animation.samplers[channel.curve].output]
             n_numbers += keys.count * keys.width
-    check_most(file.path, n_numbers, MOST_KEYS, "clips of at most {} numbers")
-    names = Names()
+    check_most(file.path, n_numbers, MAX_KEY_NUMBERS, "clips of at most {} numbers")
+    names = UniqueNames()
     clips = list[Clip]()
     for index, channels in enumerate(used_channels):
         if channels:
             animation = header.animations[index]
-            tracks = [_track(file, animation, channel, drawn) for channel in channels]
-            name = names.free(animation.name or f"clip-{index}")
+            tracks = [
+                _read_track(file, animation, channel, target_counts)
+                for channel in channels
+            ]
+            name = names.make_unique(animation.name or f"clip-{index}")
             clips.append(Clip(name, tuple(tracks)))
     return tuple(clips)
 
 
-def _track(
-    file: GltfFile, animation: Animation, channel: Channel, drawn: Mapping[int, int]
+def _read_track(
+    file: GltfFile,
+    animation: Animation,
+    channel: Channel,
+    target_counts: Mapping[int, int],
 ) -> Track:
     """Read one channel of a clip.
 
@@ -429,8 +445,8 @@ def _track(
         )
     # A cubic spline has two tangents and a value for each key.
     values_per_key = 3 if sampler.interpolation == "CUBICSPLINE" else 1
-    n_targets = drawn[node] if target_path == "weights" else 1
-    width = WIDTHS[target_path]
+    n_targets = target_counts[node] if target_path == "weights" else 1
+    width = VALUE_WIDTHS[target_path]
     output = file.header.accessors[sampler.output]
     count = len(times) * values_per_key * n_targets
     if output.count != count or output.width != width:
@@ -439,20 +455,20 @@ def _track(
             f"{len(times):,} keys of a {target_path}"
         )
         raise damaged(path, expected, f"{output.count:,} of {output.width}")
-    values = file.numbers(sampler.output, np.arange(count))
-    keys = _finite(path, "the keys of a clip", values).reshape(
+    values = file.read_numbers(sampler.output, np.arange(count))
+    keys = _require_finite(path, "the keys of a clip", values).reshape(
         len(times), values_per_key, n_targets * width
     )
     if target_path == "rotation":
         lengths = np.linalg.norm(keys[:, values_per_key // 2], axis=1)
-        if not (lengths > SHORTEST).all():
+        if not (lengths > MIN_QUATERNION_LENGTH).all():
             raise damaged(
                 path, "rotations of a clip that are unit quaternions", "one of length 0"
             )
     return Track(node, target_path, sampler.interpolation, times, keys)
 
 
-def _read_times(file: GltfFile, index: int) -> Doubles:
+def _read_times(file: GltfFile, index: int) -> Float64Array:
     """Return the times (K,) in seconds of the keys of a clip, which must rise."""
     path = file.path
     accessor = file.header.accessors[index]
@@ -463,8 +479,8 @@ def _read_times(file: GltfFile, index: int) -> Doubles:
             "keys of a clip at times in seconds, of type SCALAR and 32-bit floats",
             "others",
         )
-    values = file.numbers(index, np.arange(accessor.count))
-    times = _finite(path, "the times of a clip", values)[:, 0]
+    values = file.read_numbers(index, np.arange(accessor.count))
+    times = _require_finite(path, "the times of a clip", values)[:, 0]
     if times[0] < 0.0 or (np.diff(times) <= 0.0).any():
         raise damaged(
             path, "times of a clip from 0 that rise from key to key", "others"
@@ -472,7 +488,7 @@ def _read_times(file: GltfFile, index: int) -> Doubles:
     return times
 
 
-def _finite(path: Path, what: str, values: Doubles) -> Doubles:
+def _require_finite(path: Path, what: str, values: Float64Array) -> Float64Array:
     """Return values, or raise FileFormatError if some are NaN or infinite."""
     if not np.isfinite(values).all():
         raise damaged(path, f"finite numbers in {what}", "NaN or infinite ones")

@@ -23,15 +23,15 @@ import OpenEXR
 
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.pictures import LARGEST_PIXELS, check_pixels
-from advsearch.scene.assets import Floats
-from advsearch.scene.importing.files import damaged, looks_like, shown
+from advsearch.scene.assets import Float32Array
+from advsearch.scene.importing.files import damaged, describe_content, format_name
 from advsearch.trust.stored_files import check_most
 
 Plane = npt.NDArray[np.floating]
 Planes = tuple[Plane, Plane, Plane]
 # Limit of the pixels times channels of a file (8192 x 4096 with 4), before `scaled`.
-LARGEST = 2 * LARGEST_PIXELS
-COLORS = {
+MAX_VALUES = 2 * LARGEST_PIXELS
+CHANNEL_NAMES = {
     "r": "R",
     "red": "R",
     "g": "G",
@@ -43,7 +43,17 @@ COLORS = {
     "by": "BY",
 }
 """Names of channels, in any case, and what they hold."""
-WHOLE = ("", "rgba", "rgb", "beauty", "combined", "color", "colour", "main", "image")
+MAIN_LAYER_NAMES = (
+    "",
+    "rgba",
+    "rgb",
+    "beauty",
+    "combined",
+    "color",
+    "colour",
+    "main",
+    "image",
+)
 """Names of layers that are the image itself, the likeliest first; other layers are read
 only if there is none of these.
 """
@@ -51,11 +61,11 @@ only if there is none of these.
 # names no others.
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 PRIMARIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.329)
-CUBE = 1
+CUBE_MAP = 1
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def _suppress_output() -> Iterator[None]:
     """Suppress what OpenEXR prints about corrupt files.
 
     It prints to Python's standard output and to file descriptor 2 of the process.
@@ -86,9 +96,9 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
             colors.
     """
     if not data.startswith(b"\x76\x2f\x31\x01"):
-        raise damaged(file, "an OpenEXR picture", looks_like(data))
+        raise damaged(file, "an OpenEXR picture", describe_content(data))
     try:
-        with _quiet():
+        with _suppress_output():
             header, planes, notes = _read_layer(file, data)
     except (AdvsearchError, MemoryError):
         raise
@@ -99,14 +109,14 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
         )
         raise FileFormatError(message) from error
     environment_map = header.get("envmap")
-    if getattr(environment_map, "value", environment_map) == CUBE:
+    if getattr(environment_map, "value", environment_map) == CUBE_MAP:
         raise FileFormatError(
             f"{file}: expected a map of latitude and longitude, got "
             "a cube map; convert it"
         )
-    _, size = _window(header, "dataWindow")
+    _, size = _read_window(header, "dataWindow")
     _check_planes(file, planes, size)
-    colors = planes if "R" in planes else _colored(planes, size)
+    colors = planes if "R" in planes else _convert_luminance(planes, size)
     primaries = header.get("chromaticities")
     if primaries is not None:
         values = np.asarray(primaries, np.float64).ravel()
@@ -116,7 +126,7 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
                 "sRGB"
             )
     rgb = (colors["R"], colors["G"], colors["B"])
-    return _displayed(header, rgb, notes), notes
+    return _crop_to_display_window(header, rgb, notes), notes
 
 
 def _read_layer(
@@ -134,7 +144,7 @@ def _read_layer(
         )
         if not parts or is_incomplete:
             raise ValueError("pixels that end early")
-        header, channels, notes = _chosen(file, parts)
+        header, channels, notes = _select_layer(file, parts)
         planes = {name: channel.pixels for name, channel in channels.items()}
         return header, planes, notes
 
@@ -174,17 +184,20 @@ def _check_size(file: Path, picture: Any) -> None:
                 f"{file}: expected one value a pixel, got a deep "
                 "OpenEXR picture; flatten it"
             )
-        _, (data_height, data_width) = _window(header, "dataWindow")
-        _, (height, width) = _window(header, "displayWindow")
+        _, (data_height, data_width) = _read_window(header, "dataWindow")
+        _, (height, width) = _read_window(header, "displayWindow")
         n_pixels = max(data_width, 0) * max(data_height, 0)
         n_values += n_pixels * len(header["channels"])
         check_pixels(file, max(width, 0), max(height, 0))
     check_most(
-        file, n_values, LARGEST, "OpenEXR pictures of at most {} pixels times channels"
+        file,
+        n_values,
+        MAX_VALUES,
+        "OpenEXR pictures of at most {} pixels times channels",
     )
 
 
-def _window(
+def _read_window(
     header: Mapping[str, Any], name: str
 ) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the first row and column of a window, and its height and width."""
@@ -193,7 +206,7 @@ def _window(
     return (int(low[1]), int(low[0])), (height, width)
 
 
-def _chosen(
+def _select_layer(
     file: Path, parts: list[tuple[dict[str, Any], dict[str, Any]]]
 ) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
     """Select the layer that is the image.
@@ -203,12 +216,12 @@ def _chosen(
         parts: header and channels of each part.
 
     Returns:
-        Its header, its channels by `COLORS`, and clauses about layers left out.
+        Its header, its channels by `CHANNEL_NAMES`, and clauses about layers left out.
     """
-    layers = _color_layers(parts)
+    layers = _find_color_layers(parts)
     if not layers:
         names = sorted({name for _, channels in parts for name in channels})
-        got = ", ".join(shown(name, quoted=False) for name in names)
+        got = ", ".join(format_name(name, quoted=False) for name in names)
         expected = "expected the channels R, G and B (or Y alone)"
         raise FileFormatError(
             f"{file}: {expected}, got {got}; save the picture as plain RGB"
@@ -219,21 +232,27 @@ def _chosen(
     ) -> tuple[int, bool]:
         name, _, channels = layer
         last = name.split(".")[-1].lower()
-        name_rank = WHOLE.index(last) if last in WHOLE else len(WHOLE)
+        name_rank = (
+            MAIN_LAYER_NAMES.index(last)
+            if last in MAIN_LAYER_NAMES
+            else len(MAIN_LAYER_NAMES)
+        )
         return name_rank, "R" not in channels
 
     name, header, channels = min(layers, key=rank)
-    others = ", ".join(shown(other) for other, _, _ in layers[:20] if other != name)
+    others = ", ".join(
+        format_name(other) for other, _, _ in layers[:20] if other != name
+    )
     notes = []
     if others and name:
-        notes.append(f"of its layers {shown(name)} is taken; left out: {others}")
+        notes.append(f"of its layers {format_name(name)} is taken; left out: {others}")
     elif others:
         notes.append(f"layers are left out: {others}")
     keys = ("R", "G", "B") if "R" in channels else ("Y", "RY", "BY")
     return header, {key: channels[key] for key in keys if key in channels}, notes
 
 
-def _color_layers(
+def _find_color_layers(
     parts: list[tuple[dict[str, Any], dict[str, Any]]],
 ) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
     """Return the name, header and channels of every layer with color or luminance."""
@@ -242,7 +261,7 @@ def _color_layers(
         by_layer: dict[str, dict[str, Any]] = {}
         for name, channel in channels.items():
             layer, _, last = name.rpartition(".")
-            key = COLORS.get(last.lower(), last)
+            key = CHANNEL_NAMES.get(last.lower(), last)
             by_layer.setdefault(layer, {}).setdefault(key, channel)
         part_name = str(header.get("name", "")) if len(parts) > 1 else ""
         for layer, layer_channels in by_layer.items():
@@ -257,7 +276,9 @@ def _color_layers(
     return layers
 
 
-def _colored(planes: Mapping[str, Plane], size: tuple[int, ...]) -> dict[str, Plane]:
+def _convert_luminance(
+    planes: Mapping[str, Plane], size: tuple[int, ...]
+) -> dict[str, Plane]:
     """Convert luminance, and chroma if there is any, to red, green and blue.
 
     RY = (R - Y) / Y, and BY likewise.
@@ -293,10 +314,12 @@ def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
     return plane
 
 
-def _displayed(header: Mapping[str, Any], planes: Planes, notes: list[str]) -> Planes:
+def _crop_to_display_window(
+    header: Mapping[str, Any], planes: Planes, notes: list[str]
+) -> Planes:
     """Crop or pad planes from the data window to the display window."""
-    (data_top, data_left), data_size = _window(header, "dataWindow")
-    (top, left), (height, width) = _window(header, "displayWindow")
+    (data_top, data_left), data_size = _read_window(header, "dataWindow")
+    (top, left), (height, width) = _read_window(header, "displayWindow")
     if (data_top, data_left) == (top, left) and data_size == (height, width):
         return planes
     data_bottom = data_top + data_size[0]
@@ -333,11 +356,11 @@ _RESOLUTION = re.compile(rb"([-+])([YX]) +(\d{1,6}) +([-+])([YX]) +(\d{1,6})\r?\
 _NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
-def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Floats, list[str]]:
+def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[str]]:
     """Unpack a Radiance RGBE picture.
 
     Returns:
-        Pixels (H, W, 4) uint8, three mantissas and an exponent, row 0 on top: `linear`
+        Pixels (H, W, 4) uint8, three mantissas and an exponent, row 0 on top: `decode_rgbe`
         makes floats of them, which take three times the memory. Factors (3,) float32 of
         the linear values, the inverse of all COLORCORR lines. Clauses about what is
         left out.
@@ -348,13 +371,13 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Floats, list[str]]:
     """
     end = re.search(rb"\r?\n\r?\n", data)
     if not data.startswith(b"#?") or not end:
-        got = looks_like(data) if not data.startswith(b"#?") else "half a header"
+        got = describe_content(data) if not data.startswith(b"#?") else "half a header"
         raise damaged(path, "a Radiance .hdr picture", got)
     header = data[: end.start()]
     body = data[end.end() :]
     coding = re.search(rb"^FORMAT=\s*(\S+)", header, re.MULTILINE)
     if coding and coding[1] != b"32-bit_rle_rgbe":
-        got = shown(coding[1].decode("latin-1"), quoted=False)
+        got = format_name(coding[1].decode("latin-1"), quoted=False)
         raise FileFormatError(
             f"{path}: expected FORMAT=32-bit_rle_rgbe, got {got}; convert it to RGB"
         )
@@ -368,7 +391,7 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Floats, list[str]]:
     n_lines = int(size[3])
     line_length = int(size[6])
     check_pixels(path, line_length, n_lines)
-    pixels = _scanlines(path, body[size.end() :], n_lines, line_length)
+    pixels = _decode_scanlines(path, body[size.end() :], n_lines, line_length)
     # Flip it so that it begins at the top and at the left.
     line_step, pixel_step = (
         1 if sign + axis in (b"-Y", b"+X") else -1
@@ -377,11 +400,11 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Floats, list[str]]:
     pixels = pixels[::line_step, ::pixel_step]
     if size[2] != b"Y":
         pixels = pixels.transpose(1, 0, 2)
-    factors, notes = _color_corrections(header)
+    factors, notes = _read_color_corrections(header)
     return pixels, factors, notes
 
 
-def _color_corrections(header: bytes) -> tuple[Floats, list[str]]:
+def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
     """Return the inverse (3,) of all COLORCORR lines, and notes on invalid ones.
 
     EXPOSURE lines are ignored, as everywhere: exposure is metered.
@@ -397,11 +420,11 @@ def _color_corrections(header: bytes) -> tuple[Floats, list[str]]:
             factors = corrected
         else:
             line = "COLORCORR=" + text.decode("latin-1")
-            notes.append(f"its line {shown(line)} is left out")
+            notes.append(f"its line {format_name(line)} is left out")
     return factors.astype(np.float32), notes
 
 
-def linear(pixels: Bytes) -> Floats:
+def decode_rgbe(pixels: Bytes) -> Float32Array:
     """Convert RGBE pixels (H, W, 4) to linear values (H, W, 3) float32.
 
     A value is mantissa x 2^(exponent - 136), as in Mitsuba.
@@ -413,7 +436,7 @@ def linear(pixels: Bytes) -> Floats:
     )
 
 
-def _scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
+def _decode_scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
     """Decode scanlines to pixels (height, width, 4), run-length encoded or plain."""
     result = np.empty((height, width, 4), np.uint8)
     position = 0
@@ -422,9 +445,9 @@ def _scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
         has_mark = body[position : position + 4] == run_length_mark
         try:
             if 8 <= width < 32768 and has_mark:
-                position = _run_lengths(body, position + 4, result[row])
+                position = _decode_runs(body, position + 4, result[row])
             else:
-                position = _plain_line(body, position, result[row])
+                position = _decode_plain_line(body, position, result[row])
         except (IndexError, ValueError):
             got = (
                 f"{row} whole ones and the start of another; the file is cut short "
@@ -434,7 +457,7 @@ def _scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
     return result
 
 
-def _run_lengths(body: bytes, position: int, line: Bytes) -> int:
+def _decode_runs(body: bytes, position: int, line: Bytes) -> int:
     """Fill a line (W, 4) from its four run-length encoded channels.
 
     Returns the position after them.
@@ -459,7 +482,7 @@ def _run_lengths(body: bytes, position: int, line: Bytes) -> int:
     return position
 
 
-def _plain_line(body: bytes, position: int, line: Bytes) -> int:
+def _decode_plain_line(body: bytes, position: int, line: Bytes) -> int:
     """Fill a line (W, 4) from pixels of four bytes.
 
     A pixel (1, 1, 1, n) repeats the last one. Returns the position after the line.

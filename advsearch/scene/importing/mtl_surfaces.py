@@ -11,32 +11,32 @@ from functools import cached_property
 import numpy as np
 from PIL import Image
 
-from advsearch.scene.assets import Doubles, Floats, Ints
-from advsearch.scene.importing.files import Notes, shown, text_of
+from advsearch.scene.assets import Float32Array, Float64Array, IntArray
+from advsearch.scene.importing.files import Notes, decode_text, format_name
 from advsearch.scene.importing.parts import (
-    NEUTRAL,
+    NEUTRAL_GREY,
     ImportedSurface,
-    holds_normals,
-    instead_of_texture,
-    limited_radiance,
-    normal_map,
-    with_opacity,
+    apply_opacity,
+    compute_radiance,
+    describe_substitute,
+    has_normals,
+    make_normal_map,
 )
-from advsearch.scene.importing.pictures import FilePictures, Kind
-from advsearch.scene.importing.texture import mean_over
+from advsearch.scene.importing.pictures import FileImages, ImageKind
+from advsearch.scene.importing.texture import average_over_faces
 from advsearch.scene.importing.unread import TrackedKeys
 from advsearch.trust.named_files import References, plain_name
 
-QUIET = frozenset("ka ks ns ni sharpness map_aat".split())
+IGNORED_KEYWORDS = frozenset("ka ks ns ni sharpness map_aat".split())
 """Common statements that a physical material cannot have: ambient light, Phong's
 highlights.
 """
-NORMALS = ("norm", "map_kn", "map_bump", "bump")
-PLACED = ("map_kd", "map_d", *NORMALS, "map_ke")
+NORMAL_MAPS = ("norm", "map_kn", "map_bump", "bump")
+UV_MAPS = ("map_kd", "map_d", *NORMAL_MAPS, "map_ke")
 """Maps that are sampled at texture coordinates, with the layout of the first of them."""
 # Channels of an image by the value of ``-imfchan``.
 CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
-DEFAULTS = {
+DEFAULT_OPTIONS = {
     "blendu": "on",
     "blendv": "on",
     "cc": "off",
@@ -48,79 +48,81 @@ DEFAULTS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Painted:
+class MtlSurface:
     """A material of an .mtl file as a surface."""
 
     surface: ImportedSurface
     scale: Pair = (1.0, 1.0)  # factors of texture coordinates
     offset: Pair = (0.0, 0.0)  # added to scaled texture coordinates
-    clamped: bool = False  # whether its textures are not to repeat
+    is_clamped: bool = False  # whether its textures are not to repeat
 
 
 @dataclass
 class MtlReader:
     """Reads the material files of a mesh file, and converts materials to surfaces.
 
-    `shown_on` returns UVs (F, 3, 2) and areas (F,) of the faces with a material, by its
+    `find_mapped_faces` returns UVs (F, 3, 2) and areas (F,) of the faces with a material, by its
     name and a UDIM square.
     """
 
     references: References
     notes: Notes
-    shown_on: Callable[[str, int], tuple[Doubles, Doubles]]
-    libraries: int = 0  # how many material files were read
+    find_mapped_faces: Callable[[str, int], tuple[Float64Array, Float64Array]]
+    n_libraries: int = 0  # how many material files were read
     _materials: dict[str, MtlMaterial] = field(default_factory=dict)
-    _painted: dict[tuple[int, int], Painted] = field(default_factory=dict)
+    _surfaces: dict[tuple[int, int], MtlSurface] = field(default_factory=dict)
     _uses: dict[tuple[int, str], MapUse | None] = field(default_factory=dict)
 
     def read_library(self, name: str) -> None:
         """Read a material file; of materials with the same name, the first counts."""
         try:
-            text = text_of(self.references.get(name))
+            text = decode_text(self.references.get(name))
         except FileNotFoundError:
             file_name = plain_name(name)
-            reason = f"{shown(file_name)}, which {self.references.refused[file_name]}"
-            self.notes.say(
+            reason = (
+                f"{format_name(file_name)}, which {self.references.refused[file_name]}"
+            )
+            self.notes.warn(
                 f" names the material file {reason}; neutral grey is used instead"
             )
             return
-        self.libraries += 1
+        self.n_libraries += 1
         file = plain_name(name).rpartition("/")[2]
-        materials, stray_keywords = parsed(text, file)
+        materials, stray_keywords = parse_mtl(text, file)
         for keyword in stray_keywords:
-            self.notes.has(
-                f"before the first material of {shown(file, quoted=False)}, statement",
+            self.notes.record(
+                f"before the first material of {format_name(file, quoted=False)}, statement",
                 keyword,
             )
         for material in materials:
             first = self._materials.setdefault(material.name, material)
             if first.statements != material.statements and first.file == material.file:
-                self.notes.say(
-                    f"{file} has the material {shown(material.name)} more "
+                self.notes.warn(
+                    f"{file} has the material {format_name(material.name)} more "
                     "than once; the first counts"
                 )
         # A # may begin a comment or be part of a name: both are tried.
         for material in materials:
             self._materials.setdefault(without_comment(material.name), material)
 
-    def _named(self, name: str) -> MtlMaterial | None:
+    def _find_material(self, name: str) -> MtlMaterial | None:
         return self._materials.get(name) or self._materials.get(without_comment(name))
 
-    def painted(self, name: str, square: int = 0) -> Painted | None:
+    def get_surface(self, name: str, square: int = 0) -> MtlSurface | None:
         """Return a material by its name, which may have a comment after it, or None.
 
         If its images are one for each UDIM square, those of `square` are used; of
         square 0, those that the file names.
         """
-        material = self._named(name)
+        material = self._find_material(name)
         if material is None:
             return None
         key = (id(material), square)
-        if key not in self._painted:
-            self._painted[key] = self._look_of(material, square, name)
-        return self._painted[key]
+        if key not in self._surfaces:
+            self._surfaces[key] = self._make_surface(material, square, name)
+        return self._surfaces[key]
 
-    def squares_of(self, name: str, wanted: Sequence[int]) -> list[int]:
+    def find_squares(self, name: str, candidates: Sequence[int]) -> list[int]:
         """Return those of some UDIM squares for which a material has images.
 
         There are none if the images of the material have no square in their names, or
@@ -128,42 +130,46 @@ class MtlReader:
 
         Args:
             name: the material.
-            wanted: squares, the first of which is 1001; 0 is none.
+            candidates: squares, the first of which is 1001; 0 is none.
         """
-        material = self._named(name)
+        material = self._find_material(name)
         if material is None:
             return []
-        uses = [self._use(material, key) for key in PLACED]
+        uses = [self._parse_use(material, key) for key in UV_MAPS]
         numbered = next(
             (
                 use.name
                 for use in uses
-                if use is not None and number_in(use.name) is not None
+                if use is not None and find_square(use.name) is not None
             ),
             None,
         )
         if numbered is None:
             return []
         others = [
-            square for square in wanted if square and square != number_in(numbered)
+            square
+            for square in candidates
+            if square and square != find_square(numbered)
         ]
         if not others:
             return []
         exists = (
-            isinstance(self.references.tried(named(numbered, square)), bytes)
+            isinstance(self.references.tried(replace_square(numbered, square)), bytes)
             for square in others
         )
-        if number_in(numbered) == 0 or any(exists):
-            return [square for square in wanted if square]
-        self.notes.say(
-            f"{shown(numbered)} is named like one of several pictures (UDIM), and "
+        if find_square(numbered) == 0 or any(exists):
+            return [square for square in candidates if square]
+        self.notes.warn(
+            f"{format_name(numbered)} is named like one of several pictures (UDIM), and "
             "there is none for the "
             f"faces in {', '.join(map(str, others[:8]))}: it repeats there; put "
             "those pictures beside it"
         )
         return []
 
-    def _look_of(self, material: MtlMaterial, square: int, name: str) -> Painted:
+    def _make_surface(
+        self, material: MtlMaterial, square: int, name: str
+    ) -> MtlSurface:
         """Convert a material to a surface.
 
         Args:
@@ -171,37 +177,43 @@ class MtlReader:
             square: the UDIM square whose images are used, 0 for none.
             name: the name by which the mesh file uses it.
         """
-        is_first = not any(known == id(material) for known, _ in self._painted)
-        uses = self._uses_of(material, square)
-        first = next((uses[key] for key in PLACED if key in uses), MapUse("", {}))
+        is_first = not any(known == id(material) for known, _ in self._surfaces)
+        uses = self._parse_uses(material, square)
+        first = next((uses[key] for key in UV_MAPS if key in uses), MapUse("", {}))
         self._drop_other_layouts(material, uses, first)
-        color, texture = self._base_color(material, uses.get("map_kd"))
+        color, texture = self._make_base_color(material, uses.get("map_kd"))
         opaque = ImportedSurface(color, texture, name=material.name)
         surface = replace(
-            self._see_through(material, uses.get("map_d"), opaque),
-            roughness=self._share(material, "pr", uses.get("map_pr"), name, square),
-            metallic=self._share(material, "pm", uses.get("map_pm"), name, square),
-            normal_map=self._bumps(material, uses),
-            emission=self._glow(material, uses.get("map_ke")),
+            self._apply_opacity(material, uses.get("map_d"), opaque),
+            roughness=self._read_fraction(
+                material, "pr", uses.get("map_pr"), name, square
+            ),
+            metallic=self._read_fraction(
+                material, "pm", uses.get("map_pm"), name, square
+            ),
+            normal_map=self._make_normal_map(material, uses),
+            emission=self._make_emission(material, uses.get("map_ke")),
         )
         if is_first:
-            self._list(material)
+            self._note_unread(material)
         is_clamped = bool(first.name) and any(
             use.options.get("clamp", "").lower() == "on" for use in uses.values()
         )
-        return Painted(surface, first.scale, first.offset, is_clamped)
+        return MtlSurface(surface, first.scale, first.offset, is_clamped)
 
-    def _uses_of(self, material: MtlMaterial, square: int) -> dict[str, MapUse]:
+    def _parse_uses(self, material: MtlMaterial, square: int) -> dict[str, MapUse]:
         """Return the maps of a material by keyword, with the images of a UDIM square."""
         uses = dict[str, MapUse]()
-        for key in (*PLACED, "map_pr", "map_pm"):
-            use = self._use(material, key)
+        for key in (*UV_MAPS, "map_pr", "map_pm"):
+            use = self._parse_use(material, key)
             if use is not None:
                 uses[key] = use
-        material.keys.mark_read("illum", *(key for key in uses if key not in NORMALS))
+        material.keys.mark_read(
+            "illum", *(key for key in uses if key not in NORMAL_MAPS)
+        )
         if square:
             uses = {
-                key: replace(use, name=named(use.name, square))
+                key: replace(use, name=replace_square(use.name, square))
                 for key, use in uses.items()
             }
         return uses
@@ -210,40 +222,40 @@ class MtlReader:
         self, material: MtlMaterial, uses: dict[str, MapUse], first: MapUse
     ) -> None:
         """Remove the maps whose scale and offset differ from those of the first."""
-        for key in [key for key in PLACED if key in uses]:
+        for key in [key for key in UV_MAPS if key in uses]:
             if (uses[key].scale, uses[key].offset) != (first.scale, first.offset):
-                what = f"{material.spelled[key]} of the material {shown(material.name)}"
-                self.notes.say(
+                what = f"{material.spelling[key]} of the material {format_name(material.name)}"
+                self.notes.warn(
                     f"{what} lies elsewhere than its other maps (-s, -o); "
                     "it is left out"
                 )
                 material.keys.mark_read(key)
                 del uses[key]
 
-    def _base_color(
+    def _make_base_color(
         self, material: MtlMaterial, use: MapUse | None
-    ) -> tuple[Floats | None, Floats | None]:
+    ) -> tuple[Float32Array | None, Float32Array | None]:
         """Return the color (3,) of ``Kd`` and the texture (H, W, 3) of ``map_Kd``.
 
         A texture is not multiplied by Kd, which is an exporter's default more often
         than a tint.
         """
-        rest = material.numbers("kd")
+        rest = material.read_argument("kd")
         color = None
-        values = numbers_of(rest)
+        values = parse_numbers(rest)
         if values is not None and len(values) in (1, 3, 4):  # of four, three count
             rgb = np.clip(np.broadcast_to(values[:3], (3,)), 0.0, 1.0)
             color = rgb.astype(np.float32)
         elif "kd" in material.statements:
-            what = f"the Kd {shown(rest)} of the material {shown(material.name)}"
-            self.notes.say(f"{what} is no colour; neutral grey is used instead")
-        instead = f"{instead_of_texture(color)} is used instead"
+            what = f"the Kd {format_name(rest)} of the material {format_name(material.name)}"
+            self.notes.warn(f"{what} is no colour; neutral grey is used instead")
+        instead = f"{describe_substitute(color)} is used instead"
         words = f"{material.file} names the texture {{name}}, which {{why}}; {instead}"
-        texture = self._picture(use, "colours and alpha", words)
+        texture = self._load_image(use, "colours and alpha", words)
         if use is not None and texture is not None:
             if texture[:, :, 3].min() < 1.0 and "map_d" not in material.statements:
-                self.notes.say(
-                    f"the alpha of {shown(use.name)} is left out: no map_d "
+                self.notes.warn(
+                    f"the alpha of {format_name(use.name)} is left out: no map_d "
                     "makes it an opacity"
                 )
             texture = np.ascontiguousarray(texture[:, :, :3])
@@ -251,53 +263,53 @@ class MtlReader:
             color = None  # plain white does not change a texture
         return color, texture
 
-    def _list(self, material: MtlMaterial) -> None:
+    def _note_unread(self, material: MtlMaterial) -> None:
         """Note the statements that are not read, unless they change nothing."""
         zero_keys = {
             key
             for key in material.statements
-            if not any(numbers_of(material.peek_numbers(key)) or [1.0])
+            if not any(parse_numbers(material.peek_argument(key)) or [1.0])
         }
-        base = map_of(without_comment(material.statements.get("map_kd", "")))
+        base = parse_map(without_comment(material.statements.get("map_kd", "")))
 
         def is_quiet(key: str, statement: str) -> bool:
             rest = without_comment(statement)
-            if not rest or key in QUIET or key in zero_keys:
+            if not rest or key in IGNORED_KEYWORDS or key in zero_keys:
                 return True
             if key == "pcr" and "pc" in zero_keys:
                 return True
             if key == "tf":
                 return len(set(rest.split())) == 1
             if key == "map_ka":
-                use = map_of(rest)
+                use = parse_map(rest)
                 return use is not None and base is not None and use.name == base.name
             return False
 
-        for key in material.again:
-            self.notes.has("earlier material statement", key)
-        if len(material.peek_numbers("kd").split()) == 4:
-            self.notes.has("fourth number of", material.spelled["kd"])
-        if material.peek_numbers("illum") not in ("", "0", "1", "2"):
-            self.notes.has(
+        for key in material.overridden:
+            self.notes.record("earlier material statement", key)
+        if len(material.peek_argument("kd").split()) == 4:
+            self.notes.record("fourth number of", material.spelling["kd"])
+        if material.peek_argument("illum") not in ("", "0", "1", "2"):
+            self.notes.record(
                 "illumination model", without_comment(material.statements["illum"])
             )
-        for name in material.keys.unread(is_quiet):
-            self.notes.has("material statement", name)
+        for name in material.keys.find_unread(is_quiet):
+            self.notes.record("material statement", name)
 
-    def _use(self, material: MtlMaterial, key: str) -> MapUse | None:
+    def _parse_use(self, material: MtlMaterial, key: str) -> MapUse | None:
         """Parse a statement that names an image, and note options that are not read."""
         if (id(material), key) in self._uses:
             return self._uses[id(material), key]
         rest = material.statements.get(key, "")
-        use = map_of(without_comment(rest))
-        with_comment = map_of(rest)
+        use = parse_map(without_comment(rest))
+        with_comment = parse_map(rest)
         if with_comment is not None and with_comment != use:
             if isinstance(self.references.tried(with_comment.name), bytes):
                 use = with_comment  # the # belongs to the name
         self._uses[id(material), key] = use
         has_colors = key in ("map_kd", "map_ke")
         read_options = ["s", "o", "mm", "clamp"]
-        if key in NORMALS:
+        if key in NORMAL_MAPS:
             read_options.append("bm")
         elif not has_colors:
             read_options.append("imfchan")
@@ -307,15 +319,17 @@ class MtlReader:
         def is_quiet(option: str, value: str) -> bool:
             if option == "colorspace":
                 return value.lower() == ("srgb" if has_colors else "linear")
-            is_default = value.lower() == DEFAULTS.get(option)
-            is_zero = not any(numbers_of(value) or [1.0])
+            is_default = value.lower() == DEFAULT_OPTIONS.get(option)
+            is_zero = not any(parse_numbers(value) or [1.0])
             return (is_default or is_zero) and option != "imfchan"
 
-        for option in options.unread(is_quiet):
-            self.notes.has("texture option", f"-{option} of {material.spelled[key]}")
+        for option in options.find_unread(is_quiet):
+            self.notes.record(
+                "texture option", f"-{option} of {material.spelling[key]}"
+            )
         return use
 
-    def _see_through(
+    def _apply_opacity(
         self, material: MtlMaterial, use: MapUse | None, surface: ImportedSurface
     ) -> ImportedSurface:
         """Return a surface with its opacity.
@@ -323,17 +337,17 @@ class MtlReader:
         It is ``d``, or 1 - ``Tr``, which some programs write for d, times the image of
         ``map_d``.
         """
-        factor = self._opacity_factor(material)
-        image = self._picture(
+        factor = self._read_opacity(material)
+        image = self._load_image(
             use, "colours and alpha", "the opacity {name} {why}; it is opaque instead"
         )
         if image is None and factor == 1.0:
             return surface
         color = surface.color
         texture = surface.texture
-        plain_color = np.full(3, NEUTRAL, np.float32) if color is None else color
+        plain_color = np.full(3, NEUTRAL_GREY, np.float32) if color is None else color
         if use is not None and image is not None:
-            opacity = _channel(image, use)
+            opacity = _select_channel(image, use)
             if texture is None:
                 texture = np.broadcast_to(plain_color, (*opacity.shape, 3))
             size = (texture.shape[1], texture.shape[0])
@@ -346,34 +360,34 @@ class MtlReader:
         factor_array = np.array([factor], np.float32)
         return replace(
             surface,
-            color=with_opacity(color, factor_array, None),
-            texture=with_opacity(texture, factor_array, None),
+            color=apply_opacity(color, factor_array, None),
+            texture=apply_opacity(texture, factor_array, None),
         )
 
-    def _opacity_factor(self, material: MtlMaterial) -> float:
+    def _read_opacity(self, material: MtlMaterial) -> float:
         """Return the opacity in [0, 1] that ``d`` or ``Tr`` states, 1 by default."""
-        if "-halo" in material.numbers("d").lower().split():
-            self.notes.has("option", "-halo of d")
-        opacity = share_of(material.numbers("d"), -1.0)  # -1: there is none
-        transparency = share_of(material.numbers("tr"), -1.0)
-        what = f"the material {shown(material.name)} has Tr {transparency:g}"
+        if "-halo" in material.read_argument("d").lower().split():
+            self.notes.record("option", "-halo of d")
+        opacity = parse_fraction(material.read_argument("d"), -1.0)  # -1: there is none
+        transparency = parse_fraction(material.read_argument("tr"), -1.0)
+        what = f"the material {format_name(material.name)} has Tr {transparency:g}"
         if opacity >= 0.0 and transparency >= 0.0:
             agrees_as_opacity = abs(transparency - opacity) <= 0.01
             agrees = abs(1.0 - transparency - opacity) <= 0.01
             if not agrees_as_opacity and not agrees:
-                self.notes.say(
+                self.notes.warn(
                     f"{what} beside d {opacity:g}, which it contradicts; d is "
                     "taken for its opacity"
                 )
         elif opacity < 0.0 < transparency:
-            self.notes.say(
+            self.notes.warn(
                 f"{what} and no d: it is taken for transparency, which makes its "
                 f"opacity {1.0 - transparency:g}; some programs"
                 f" mean opacity by it, so write d in its place"
             )
         return opacity if opacity >= 0.0 else 1.0 - max(transparency, 0.0)
 
-    def _share(
+    def _read_fraction(
         self,
         material: MtlMaterial,
         key: str,
@@ -385,66 +399,78 @@ class MtlReader:
 
         It is the mean of its map over the faces that show it, or else its number.
         """
-        words = f"{material.spelled.get(f'map_{key}')} {{name}} {{why}}; it is left out"
-        image = self._picture(use, "numbers", words)
-        number = share_of(material.numbers(key), -1.0)
+        words = (
+            f"{material.spelling.get(f'map_{key}')} {{name}} {{why}}; it is left out"
+        )
+        image = self._load_image(use, "numbers", words)
+        number = parse_fraction(material.read_argument(key), -1.0)
         if use is not None and image is not None:
-            self.notes.say(
+            self.notes.warn(
                 "textures of roughness and metallic are replaced by their means"
             )
-            uvs, areas = self.shown_on(name, square)
-            channel = _channel(image, use)[:, :, None]
-            return float(mean_over(channel, uvs * use.scale + use.offset, areas)[0])
+            uvs, areas = self.find_mapped_faces(name, square)
+            channel = _select_channel(image, use)[:, :, None]
+            return float(
+                average_over_faces(channel, uvs * use.scale + use.offset, areas)[0]
+            )
         return number if number >= 0.0 else None
 
-    def _bumps(self, material: MtlMaterial, uses: dict[str, MapUse]) -> Floats | None:
+    def _make_normal_map(
+        self, material: MtlMaterial, uses: dict[str, MapUse]
+    ) -> Float32Array | None:
         """Return the first usable normal map (H, W, 3) of a material, or None."""
         words = "the normal map {name} {why}; it is left out"
-        for key in NORMALS:
+        for key in NORMAL_MAPS:
             if key not in uses:
                 continue
             use = uses[key]
-            image = self._picture(use, "numbers", words)
+            image = self._load_image(use, "numbers", words)
             material.keys.mark_read(
                 *(other for other in uses if uses[other].name == use.name)
             )
             if image is not None:
-                if key in ("norm", "map_kn") or holds_normals(image):
-                    return normal_map(image, use.bump)
-                self._pictures.lacks(use.name, "holds heights, and no normals", words)
+                if key in ("norm", "map_kn") or has_normals(image):
+                    return make_normal_map(image, use.bump)
+                self._images.note_missing(
+                    use.name, "holds heights, and no normals", words
+                )
         return None
 
-    def _glow(self, material: MtlMaterial, use: MapUse | None) -> Floats | None:
+    def _make_emission(
+        self, material: MtlMaterial, use: MapUse | None
+    ) -> Float32Array | None:
         """Return the radiance of ``Ke`` and ``map_Ke``, (H, W, 3), or None."""
-        values = numbers_of(material.numbers("ke") or "0")
+        values = parse_numbers(material.read_argument("ke") or "0")
         if values is None or len(values) not in (1, 3) or min(values) < 0:
-            self.notes.say(
-                f"the emission {shown(material.numbers('ke'))} is no "
+            self.notes.warn(
+                f"the emission {format_name(material.read_argument('ke'))} is no "
                 "colour; it is left out"
             )
             return None
         factor = np.broadcast_to(values, (3,))
-        image = self._picture(
+        image = self._load_image(
             use, "colours", "the texture {name} of the emission {why}; it is left out"
         )
         if use is not None and image is None:
             return None
         if use is not None and not factor.any():
             factor = np.ones(3)  # exporters leave Ke at 0 beside a map
-        return limited_radiance(factor, image, self.notes)
+        return compute_radiance(factor, image, self.notes)
 
     @cached_property
-    def _pictures(self) -> FilePictures:
-        return FilePictures(len(self._materials), self.references, self.notes)
+    def _images(self) -> FileImages:
+        return FileImages(len(self._materials), self.references, self.notes)
 
-    def _picture(self, use: MapUse | None, kind: Kind, words: str) -> Floats | None:
+    def _load_image(
+        self, use: MapUse | None, kind: ImageKind, words: str
+    ) -> Float32Array | None:
         """Return the values (H, W, C) of an image with its ``-mm`` applied.
 
         None, and a note, if it cannot be read.
         """
         if use is None:
             return None
-        image = self._pictures.of_file(use.name, kind, words)
+        image = self._images.load_file(use.name, kind, words)
         if image is None or use.range == (0.0, 1.0):
             return image
         base, gain = map(np.float32, use.range)
@@ -452,7 +478,7 @@ class MtlReader:
         return np.concatenate([colors, image[:, :, 3:]], axis=2)
 
 
-def _channel(picture: Floats, use: MapUse) -> Floats:
+def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
     """Return the values (H, W) of an image for a map of numbers.
 
     They are the channel that ``-imfchan`` names, or else the alpha, or the mean of the
@@ -463,23 +489,23 @@ def _channel(picture: Floats, use: MapUse) -> Floats:
     if channel is None and has_alpha and picture[:, :, 3].min() < 1.0:
         channel = 3
     if channel is None or (channel == 3 and not has_alpha):
-        mean: Floats = picture[:, :, :3].mean(axis=2)
+        mean: Float32Array = picture[:, :, :3].mean(axis=2)
         return mean
     return picture[:, :, channel]
 
 
-def libraries_of(rests: Sequence[str], references: References) -> list[str]:
+def find_libraries(arguments: Sequence[str], references: References) -> list[str]:
     """Return the names of the material files that ``mtllib`` lines name.
 
     A line may name several files, and a name may have blanks. So a line that is itself
     the name of a file is one name; else a name ends in ``.mtl``; else at a blank.
 
     Args:
-        rests: what follows ``mtllib`` in each line.
+        arguments: what follows ``mtllib`` in each line.
         references: finds files beside the mesh file.
     """
     names: list[str] = []
-    for rest in rests:
+    for rest in arguments:
         plain = without_comment(rest)
         if _exists(references, rest):
             names.append(rest)
@@ -522,43 +548,47 @@ def _split_libraries(line: str) -> list[str]:
 # The square from (0, 0) is 1001, those to its right count on to 1010, and each row
 # above adds 10.
 
-FIRST = 1001
-ACROSS = 10
-_NUMBER = re.compile(r"(?<!\d)1\d{3}(?=\.\w+$)")
-_PLACE = re.compile(r"<UDIM>", re.IGNORECASE)
+FIRST_SQUARE = 1001
+SQUARES_PER_ROW = 10
+_SQUARE_NUMBER = re.compile(r"(?<!\d)1\d{3}(?=\.\w+$)")
+_PLACEHOLDER = re.compile(r"<UDIM>", re.IGNORECASE)
 
 
-def number_in(name: str) -> int | None:
+def find_square(name: str) -> int | None:
     """Return the UDIM square in the name of an image, or None if it has none.
 
     It is 0 if the name has the placeholder ``<UDIM>``.
     """
-    if _PLACE.search(name):
+    if _PLACEHOLDER.search(name):
         return 0
-    match = _NUMBER.search(name)
-    if match is None or int(match[0]) < FIRST:
+    match = _SQUARE_NUMBER.search(name)
+    if match is None or int(match[0]) < FIRST_SQUARE:
         return None
     return int(match[0])
 
 
-def named(name: str, number: int) -> str:
+def replace_square(name: str, square: int) -> str:
     """Return the name of an image with another UDIM square in it."""
-    pattern = _PLACE if _PLACE.search(name) else _NUMBER
-    return pattern.sub(str(number), name)
+    pattern = _PLACEHOLDER if _PLACEHOLDER.search(name) else _SQUARE_NUMBER
+    return pattern.sub(str(square), name)
 
 
-def squares(uvs: Doubles) -> Ints:
+def compute_squares(uvs: Float64Array) -> IntArray:
     """Return the UDIM squares (F,) of the centers of faces (F, 3, 2); 0 for none."""
     column, row = np.floor(uvs.mean(axis=1)).T
-    is_valid = (column >= 0) & (column < ACROSS) & (row >= 0) & (row < 100)
-    return np.where(is_valid, FIRST + column + ACROSS * row, 0).astype(np.int64)
+    is_valid = (column >= 0) & (column < SQUARES_PER_ROW) & (row >= 0) & (row < 100)
+    return np.where(is_valid, FIRST_SQUARE + column + SQUARES_PER_ROW * row, 0).astype(
+        np.int64
+    )
 
 
-def corner_of(square: int) -> tuple[int, int]:
+def get_square_corner(square: int) -> tuple[int, int]:
     """Return the UV at which a UDIM square begins; (0, 0) for no square."""
     if not square:
         return 0, 0
-    return (square - FIRST) % ACROSS, (square - FIRST) // ACROSS
+    return (square - FIRST_SQUARE) % SQUARES_PER_ROW, (
+        square - FIRST_SQUARE
+    ) // SQUARES_PER_ROW
 
 
 # ---- The grammar of material files (.mtl) ----
@@ -603,27 +633,27 @@ class MtlMaterial:
     name: str  # as it stands after ``newmtl``, with what may be a comment
     file: str  # name of the material file
     statements: dict[str, str] = field(default_factory=dict)
-    spelled: dict[str, str] = field(default_factory=dict)
+    spelling: dict[str, str] = field(default_factory=dict)
     # Keywords of statements that a later, different one overrides.
-    again: list[str] = field(default_factory=list)
+    overridden: list[str] = field(default_factory=list)
 
     @cached_property
     def keys(self) -> TrackedKeys[str]:
         """The statements, tracking which of them are read."""
         return TrackedKeys(
-            {self.spelled[key]: rest for key, rest in self.statements.items()},
+            {self.spelling[key]: rest for key, rest in self.statements.items()},
             fold=str.lower,
         )
 
-    def numbers(self, key: str) -> str:
+    def read_argument(self, key: str) -> str:
         """Return the arguments of a statement of numbers, "" if there is none.
 
         The statement counts as read.
         """
         self.keys.mark_read(key)
-        return self.peek_numbers(key)
+        return self.peek_argument(key)
 
-    def peek_numbers(self, key: str) -> str:
+    def peek_argument(self, key: str) -> str:
         """Return what `numbers` returns, without counting the statement as read."""
         return self.statements.get(key, "").partition("#")[0].strip()
 
@@ -643,7 +673,7 @@ class MapUse:
     bump: float = 1.0  # the factor of a normal map's x and y (``-bm``)
 
 
-def parsed(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
+def parse_mtl(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
     """Parse the text of a material file.
 
     Returns:
@@ -662,9 +692,9 @@ def parsed(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
             material = materials[-1]
             value = rest.strip()
             if material.statements.get(key, value) != value:
-                material.again.append(keyword)
+                material.overridden.append(keyword)
             material.statements[key] = value
-            material.spelled[key] = keyword
+            material.spelling[key] = keyword
         else:
             stray_keywords.append(keyword)
     return materials, stray_keywords
@@ -675,17 +705,17 @@ def without_comment(text: str) -> str:
     return _COMMENT.sub("", text).strip()
 
 
-def map_of(rest: str) -> MapUse | None:
+def parse_map(argument: str) -> MapUse | None:
     """Parse the arguments of a statement that names an image; None if it names none.
 
     Options stand before or after the name, which may have blanks.
     """
     options: dict[str, str] = {}
-    for match in _OPTION.finditer(rest):
+    for match in _OPTION.finditer(argument):
         for key in _OPTIONS:
             if match[key] is not None:
                 options[key] = match[f"{key}_"]
-    name = " ".join(_OPTION.sub("", rest).split())
+    name = " ".join(_OPTION.sub("", argument).split())
     while unknown := _UNKNOWN.match(name):
         options[unknown[1].lower()] = ""
         name = name[unknown.end() :]
@@ -712,19 +742,19 @@ def _parse_pair(options: dict[str, str], key: str, default: Pair) -> Pair:
     return (u, v) if abs(u) < 1e6 and abs(v) < 1e6 else default
 
 
-def numbers_of(rest: str) -> list[float] | None:
+def parse_numbers(argument: str) -> list[float] | None:
     """Return the finite numbers of a statement; None if it has other words, or none."""
     try:
-        values = [float(word) for word in rest.split()]
+        values = [float(word) for word in argument.split()]
     except ValueError:
         return None
     return values if values and all(map(math.isfinite, values)) else None
 
 
-def share_of(rest: str, otherwise: float) -> float:
+def parse_fraction(argument: str, default: float) -> float:
     """Return the last word of a statement as a number clipped to [0, 1].
 
-    It is `otherwise` if that is no number; options may stand before it.
+    It is `default` if that is no number; options may stand before it.
     """
-    values = numbers_of(" ".join(rest.split()[-1:]))
-    return otherwise if values is None else min(max(values[0], 0.0), 1.0)
+    values = parse_numbers(" ".join(argument.split()[-1:]))
+    return default if values is None else min(max(values[0], 0.0), 1.0)

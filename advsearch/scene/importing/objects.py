@@ -20,37 +20,41 @@ from scipy.spatial import ConvexHull, QhullError
 from advsearch.errors import InputError
 from advsearch.pictures import without_pillows_limit
 from advsearch.scene.assets import (
-    FACINGS,
-    LARGEST,
-    SMALLEST,
-    Doubles,
+    FRONT_AXES,
+    MAX_METRES,
+    MIN_METRES,
     FileAxis,
-    Floats,
+    Float32Array,
+    Float64Array,
     Material,
     Mesh,
     ObjectAsset,
-    grouped,
-    normalised,
+    group_indices,
+    normalise_mesh,
 )
 from advsearch.scene.importing import gltf, gltf_parts
-from advsearch.scene.importing.files import Notes, safe_name, shown
+from advsearch.scene.importing.files import Notes, format_name, make_safe_name
 from advsearch.scene.importing.geometry import (
     Soup,
     assemble,
-    compute_turn,
-    extent_of,
-    join,
-    repaired,
+    compute_extent,
+    compute_rotation,
+    join_parts,
+    repair,
 )
 from advsearch.scene.importing.gltf_entries import Header
-from advsearch.scene.importing.parts import ImportedPart, ImportedSurface, visible
+from advsearch.scene.importing.parts import (
+    ImportedPart,
+    ImportedSurface,
+    select_visible,
+)
 from advsearch.scene.importing.readers import (
-    GLTF,
+    GLTF_SUFFIXES,
     get_reader,
     list_suffixes,
     read_mesh_bytes,
 )
-from advsearch.scene.importing.texture import by_material, textured
+from advsearch.scene.importing.texture import apply_textures, index_materials
 
 
 def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
@@ -75,7 +79,7 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         return get_reader(path.suffix.lower())(path, data, notes), list(notes)
 
 
-MOST_WARNINGS = 20  # warnings about one file
+MAX_WARNINGS = 20  # warnings about one file
 
 
 def import_object(
@@ -107,7 +111,7 @@ def import_object(
         path: a file of one of the kinds of `advsearch.files.MESHES`.
         up: the axis of the file that points up; None: that of its format, or else the
             one that its shape suggests.
-        facing: the axis of the file, one of `FACINGS`, along which the object's front
+        facing: the axis of the file, one of `FRONT_AXES`, along which the object's front
             faces; None: that of its format (`find_front`).
 
     Raises:
@@ -123,28 +127,28 @@ def import_object(
     parts, notes = read_parts(file, data)
     header = None
     format_up: str | None = up
-    if file.suffix.lower() in GLTF:
+    if file.suffix.lower() in GLTF_SUFFIXES:
         header = gltf.read_header(file, data)
-        notes += gltf_parts.beside(header, file.name)
+        notes += gltf_parts.describe_left_out(header, file.name)
         format_up = up or "y"
     if facing is None:
         front = find_front(file, header, up)
     else:
         front = FileAxis(check_facing(facing, format_up))
-    return object_of(parts, notes, file, safe_name(file), up, front)
+    return make_object(parts, notes, file, make_safe_name(file), up, front)
 
 
 def check_facing(facing: str, up: str | None) -> str:
-    """Return an axis of `FACINGS`, completing a plus sign that was left out.
+    """Return an axis of `FRONT_AXES`, completing a plus sign that was left out.
 
     Raises:
         InputError: it is no such axis, or the axis that points up.
     """
     axis = facing if facing.startswith(("+", "-")) else f"+{facing}"
-    if axis not in FACINGS:
+    if axis not in FRONT_AXES:
         raise InputError(
             "facing: expected an axis of the file, one of "
-            f"{', '.join(FACINGS)}, got {facing!r}"
+            f"{', '.join(FRONT_AXES)}, got {facing!r}"
         )
     if axis[1] == up:
         raise InputError(
@@ -154,12 +158,12 @@ def check_facing(facing: str, up: str | None) -> str:
     return axis
 
 
-OUR_FRONT = "+x"
+DEFAULT_FRONT = "+x"
 """The front in formats that define none: the axis along which bundled objects face."""
 # The axis that points up, by that of a front which rules out one of the two.
 UP_OF_FRONT = {"y": "z", "z": "y"}
-BLEND = ".blend"
-USD = (".usd", ".usda", ".usdc", ".usdz")
+BLEND_SUFFIX = ".blend"
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 VRM_0 = "VRM"  # extensions of glTF
 VRM_1 = "VRMC_vrm"
 
@@ -177,13 +181,13 @@ def find_front(path: Path, header: Header | None, up: str | None = None) -> File
         up: the axis that points up, if the user named it.
     """
     suffix = path.suffix.lower()
-    if header is None or suffix in USD or up == "z":
-        axis = OUR_FRONT
+    if header is None or suffix in USD_SUFFIXES or up == "z":
+        axis = DEFAULT_FRONT
         rule = "a format without a rule, as bundled objects face"
     elif VRM_0 in header.extensionsUsed and VRM_1 not in header.extensionsUsed:
         axis = "-z"
         rule = "as VRM 0 says"
-    elif suffix == BLEND:
+    elif suffix == BLEND_SUFFIX:
         axis = "+z"
         rule = "-y in Blender, as its front view shows"
     else:
@@ -198,7 +202,7 @@ def find_front(path: Path, header: Header | None, up: str | None = None) -> File
     )
 
 
-def object_of(
+def make_object(
     parts: list[ImportedPart],
     notes: list[str],
     file: Path,
@@ -220,27 +224,27 @@ def object_of(
         InputError: the geometry has NaN, infinite, or coincident vertices only.
     """
     more_notes = Notes(file)
-    is_gltf = file.suffix.lower() in GLTF
-    parts = _visible_parts(parts, more_notes)
+    is_gltf = file.suffix.lower() in GLTF_SUFFIXES
+    parts = _select_visible_parts(parts, more_notes)
     up_axis = _find_up(parts, file, up, front)
-    turn = compute_turn(up_axis.axis, front.axis)
+    turn = compute_rotation(up_axis.axis, front.axis)
     surfaces = [part.surface for part in parts]
-    soup = repaired(join(parts, str(file), turn), str(file), more_notes)
-    soup, maps = textured(soup, surfaces, more_notes)
+    soup = repair(join_parts(parts, str(file), turn), str(file), more_notes)
+    soup, maps = apply_textures(soup, surfaces, more_notes)
     opacity = None
     if maps.color.shape[2] == 4:
         opacity = np.ascontiguousarray(maps.color[:, :, 3])
         if not opacity.any():
             opacity = None
-            more_notes.say("it is transparent all over; it is shown opaque")
-    material = _mean_material(soup, surfaces, more_notes)
-    extent = extent_of(parts) * float(
+            more_notes.warn("it is transparent all over; it is shown opaque")
+    material = _compute_mean_material(soup, surfaces, more_notes)
+    extent = compute_extent(parts) * float(
         np.ptp(soup.points[soup.faces].reshape(-1, 3), axis=0).max()
     )
-    has_unit = is_gltf and SMALLEST <= extent <= LARGEST
+    has_unit = is_gltf and MIN_METRES <= extent <= MAX_METRES
     return ObjectAsset(
         name=name,
-        mesh=_mesh(soup, surfaces, file, parts, turn),
+        mesh=_make_mesh(soup, surfaces, file, parts, turn),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=material,
         source=str(file),
@@ -249,19 +253,23 @@ def object_of(
         front=front,
         opacity=opacity,
         normal_map=maps.normals,
-        emission=_let_out(maps.emission, opacity),
+        emission=_compute_emitted(maps.emission, opacity),
         metres=extent if has_unit else None,
         extent=extent,
     )
 
 
-def _visible_parts(parts: list[ImportedPart], notes: Notes) -> list[ImportedPart]:
+def _select_visible_parts(
+    parts: list[ImportedPart], notes: Notes
+) -> list[ImportedPart]:
     """Return the parts that are not fully transparent, and note the others."""
-    visible_parts = visible(parts)
+    visible_parts = select_visible(parts)
     transparent = [part for part in parts if part not in visible_parts]
-    names = dict.fromkeys(shown(part.surface.name or "a part") for part in transparent)
+    names = dict.fromkeys(
+        format_name(part.surface.name or "a part") for part in transparent
+    )
     if names:
-        notes.say(
+        notes.warn(
             f"all light passes through {', '.join(names)} (opacity 0): left out; give "
             "it an opacity to see it"
         )
@@ -274,15 +282,15 @@ def _find_up(
     """Return the axis that points up: the user's, the format's, or a guess."""
     if up:
         return FileAxis(up)
-    if file.suffix.lower() in GLTF:
+    if file.suffix.lower() in GLTF_SUFFIXES:
         return FileAxis("y")
     if front.axis[1] in UP_OF_FRONT:
         return FileAxis(UP_OF_FRONT[front.axis[1]])
-    as_stored = join(parts, str(file), np.eye(3))
+    as_stored = join_parts(parts, str(file), np.eye(3))
     return guess_up(as_stored.points[np.unique(as_stored.faces)], file.name)
 
 
-def _mean_material(
+def _compute_mean_material(
     soup: Soup, surfaces: list[ImportedSurface], notes: Notes
 ) -> Material:
     """Return the roughness and metallic of all surfaces, averaged by area."""
@@ -300,7 +308,7 @@ def _mean_material(
     if not (visible_values == visible_values[0]).all():
         means = (values * area[:, None]).sum(axis=0) / area.sum()
         roughness, metallic = map(float, means)
-        notes.say(
+        notes.warn(
             "the roughness and metallic of its materials are replaced by their "
             f"means ({roughness:.2g} and {metallic:.2g})"
         )
@@ -308,33 +316,35 @@ def _mean_material(
 
 
 def _limit_warnings(warnings: list[str], file: Path) -> tuple[str, ...]:
-    """Return the first `MOST_WARNINGS` warnings, and one that counts the rest."""
-    n_more = len(warnings) - MOST_WARNINGS
+    """Return the first `MAX_WARNINGS` warnings, and one that counts the rest."""
+    n_more = len(warnings) - MAX_WARNINGS
     if n_more <= 0:
         return tuple(warnings)
     rest = f"{file.name}: {n_more:,} more warnings are left out"
-    return (*warnings[:MOST_WARNINGS], rest)
+    return (*warnings[:MAX_WARNINGS], rest)
 
 
-def _mesh(
+def _make_mesh(
     soup: Soup,
     surfaces: list[ImportedSurface],
     file: Path,
     parts: list[ImportedPart],
-    turn: Doubles,
+    turn: Float64Array,
 ) -> Mesh:
     """Return the normalised mesh with its materials, and a rig if something moves it.
 
     `turn` (3, 3) leads from the file's axes to ours.
     """
-    material_names, material_of_face = by_material(soup, surfaces)
-    faces_by_material = zip(material_names, grouped(material_of_face), strict=False)
+    material_names, material_of_face = index_materials(soup, surfaces)
+    faces_by_material = zip(
+        material_names, group_indices(material_of_face), strict=False
+    )
     materials = {
         name: faces for name, faces in faces_by_material if name and len(faces)
     }
     try:
         mesh, stored_vertices = assemble(soup)
-        normalised_mesh = replace(normalised(mesh), materials=materials)
+        normalised_mesh = replace(normalise_mesh(mesh), materials=materials)
     except InputError as error:  # it does not name the file
         raise InputError(f"{file}: {error}") from None
     if stored_vertices is None:
@@ -343,14 +353,16 @@ def _mesh(
     from advsearch.scene.rigged import SkeletonRig
 
     movable_parts = [part.movable for part in parts if part.movable is not None]
-    size = extent_of(parts) * float(
+    size = compute_extent(parts) * float(
         np.ptp(mesh.vertices.astype(np.float64), axis=0).max()
     )
     rig = SkeletonRig(movable_parts, stored_vertices, turn / size)
     return replace(normalised_mesh, rig=rig)
 
 
-def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
+def _compute_emitted(
+    emission: Float32Array | None, opacity: Float32Array | None
+) -> Float32Array | None:
     """Return the radiance (H, W, 3) that leaves a surface: emission times opacity.
 
     Both maps are brought to the larger of their sizes. None: it emits nothing.
@@ -369,16 +381,16 @@ def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
     return radiance if radiance.any() else None
 
 
-TOUCHING = 0.02
+TOUCHING_HEIGHT = 0.02
 """Height, as a fraction of the largest extent, up to which a vertex touches the ground:
 feet and scans are uneven.
 """
 # The fractions of two axes must differ by more than this factor for the shape to tell
 # which one is up.
-CLEAR = 1.1
+MIN_UP_RATIO = 1.1
 
 
-def guess_up(points: Doubles, name: str) -> FileAxis:
+def guess_up(points: Float64Array, name: str) -> FileAxis:
     """Guess which axis of a mesh points up, y or z, from its shape alone.
 
     What stands on a table touches it with a large fraction of what it covers, seen from
@@ -395,16 +407,16 @@ def guess_up(points: Doubles, name: str) -> FileAxis:
         The axis, z if the shape does not tell, and a note with the reason.
     """
     fractions = {
-        "y": touching_share(points[:, [2, 0, 1]]),
-        "z": touching_share(points),
+        "y": compute_touching_fraction(points[:, [2, 0, 1]]),
+        "z": compute_touching_fraction(points),
     }
     axis = "z"
     other = "y"
-    if fractions["y"] > CLEAR * fractions["z"]:
+    if fractions["y"] > MIN_UP_RATIO * fractions["z"]:
         axis = "y"
         other = "z"
     reason = "its shape does not tell, as it rests as well either way"
-    if fractions[axis] > CLEAR * fractions[other]:
+    if fractions[axis] > MIN_UP_RATIO * fractions[other]:
         reason = (
             f"it then rests on {100 * fractions[axis]:.0f} % of what it covers, seen "
             f"from above, and on {100 * fractions[other]:.0f} % otherwise"
@@ -416,20 +428,20 @@ def guess_up(points: Doubles, name: str) -> FileAxis:
     )
 
 
-def touching_share(points: Doubles) -> float:
+def compute_touching_fraction(points: Float64Array) -> float:
     """Return the fraction of an object's footprint that touches the ground, in [0, 1].
 
     Up is the third axis of its points (P, 3). Areas are those of convex hulls.
     """
     height = points[:, 2] - points[:, 2].min()
-    is_touching = height <= TOUCHING * np.ptp(points, axis=0).max()
-    covered_area = _hull_area(points[:, :2])
+    is_touching = height <= TOUCHING_HEIGHT * np.ptp(points, axis=0).max()
+    covered_area = _compute_hull_area(points[:, :2])
     if covered_area <= 0.0:
         return 0.0
-    return _hull_area(points[is_touching, :2]) / covered_area
+    return _compute_hull_area(points[is_touching, :2]) / covered_area
 
 
-def _hull_area(points: Doubles) -> float:
+def _compute_hull_area(points: Float64Array) -> float:
     """Return the area of the convex hull of points (P, 2); 0 if they are on a line."""
     if len(points) < 3:
         return 0.0

@@ -15,26 +15,32 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.scene.assets import Bools, Doubles, Floats, Ints, grouped
+from advsearch.scene.assets import (
+    BoolArray,
+    Float32Array,
+    Float64Array,
+    IntArray,
+    group_indices,
+)
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import Notes
 from advsearch.scene.skeleton import Movable
 
 # The texel of a flat normal map.
-FLAT = np.array([0.5, 0.5, 1.0], np.float32)
-LARGEST_SCALE = 100.0  # larger factors of x and y make no visible difference
+FLAT_TEXEL = np.array([0.5, 0.5, 1.0], np.float32)
+MAX_NORMAL_SCALE = 100.0  # larger factors of x and y make no visible difference
 # Minimum z of a normal before it is scaled to length 1: it points out of the surface.
-LOWEST = 0.01
+MIN_NORMAL_Z = 0.01
 # How much bluer than red a normal map is on average; a grey map of heights is not.
-BLUE = 0.1
-LENGTH = 0.2
-MOSTLY = 0.9
+MIN_BLUENESS = 0.1
+MAX_LENGTH_ERROR = 0.2
+MIN_NORMAL_FRACTION = 0.9
 """Largest error of the length of a normal in an image, and the fraction of the texels for
 which it must hold.
 """
 
 
-def normal_map(picture: Floats, scale: float = 1.0) -> Floats:
+def make_normal_map(picture: Float32Array, scale: float = 1.0) -> Float32Array:
     """Convert an image to a normal map whose unit normals point out of the surface.
 
     Args:
@@ -44,14 +50,14 @@ def normal_map(picture: Floats, scale: float = 1.0) -> Floats:
     Returns:
         (H, W, 3) texels.
     """
-    factor = min(max(scale, -LARGEST_SCALE), LARGEST_SCALE)
+    factor = min(max(scale, -MAX_NORMAL_SCALE), MAX_NORMAL_SCALE)
     normals = picture * 2.0 - 1.0
     normals[..., :2] *= factor
-    normals[..., 2] = np.maximum(normals[..., 2], LOWEST)
-    return texels_of(normals)
+    normals[..., 2] = np.maximum(normals[..., 2], MIN_NORMAL_Z)
+    return encode_normals(normals)
 
 
-def holds_normals(picture: Floats) -> bool:
+def has_normals(picture: Float32Array) -> bool:
     """Return whether an image (H, W, 3) has normals, and not heights, which are grey.
 
     Black texels are ignored: no face shows them.
@@ -61,20 +67,22 @@ def holds_normals(picture: Floats) -> bool:
         return False
     length_error = np.abs(np.linalg.norm(used * 2.0 - 1.0, axis=1) - 1.0)
     blueness = float((used[:, 2] - used[:, 0]).mean(dtype=np.float64))
-    return blueness > BLUE and bool((length_error < LENGTH).mean() > MOSTLY)
+    return blueness > MIN_BLUENESS and bool(
+        (length_error < MAX_LENGTH_ERROR).mean() > MIN_NORMAL_FRACTION
+    )
 
 
-def texels_of(normals: npt.NDArray[np.floating]) -> Floats:
+def encode_normals(normals: npt.NDArray[np.floating]) -> Float32Array:
     """Encode normals (..., 3) of any length as texels."""
     lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
     unit_normals = normals / np.maximum(lengths, 1e-12)
     return np.asarray(unit_normals * 0.5 + 0.5, dtype=np.float32)
 
 
-NEUTRAL = 0.5  # display-referred grey of an object without material
+NEUTRAL_GREY = 0.5  # display-referred grey of an object without material
 # Limit of the radiance that a surface emits; white in the light of a bundled environment
 # is about 1.
-BRIGHTEST = 1e5
+MAX_RADIANCE = 1e5
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,18 +94,18 @@ class ImportedSurface:
     """
 
     # (3,) base colour where there is no texture; (4,) with its opacity in [0, 1]
-    color: Floats | None = None
+    color: Float32Array | None = None
     # (H, W, 3) base colour, or (H, W, 4) with the opacity
-    texture: Floats | None = None
+    texture: Float32Array | None = None
     roughness: float | None = None  # in [0, 1]
     metallic: float | None = None  # in [0, 1]
-    normal_map: Floats | None = None  # (H, W, 3) of this module
+    normal_map: Float32Array | None = None  # (H, W, 3) of this module
     # (H, W, 3) linear radiance; (1, 1, 3) where it is the same everywhere
-    emission: Floats | None = None
+    emission: Float32Array | None = None
     name: str = ""  # of the material in the file; empty where it has none
 
     @property
-    def pictures(self) -> tuple[Floats, ...]:
+    def images(self) -> tuple[Float32Array, ...]:
         """The images that are looked up by texture coordinates."""
         emission = self.emission
         if emission is not None and emission.shape == (1, 1, 3):
@@ -108,7 +116,7 @@ class ImportedSurface:
             if image is not None
         )
 
-    def with_pictures(self, pictures: Iterable[Floats]) -> ImportedSurface:
+    def with_images(self, pictures: Iterable[Float32Array]) -> ImportedSurface:
         """Return the surface with its `pictures` replaced, in their order."""
         remaining = iter(pictures)
         texture = None if self.texture is None else next(remaining)
@@ -121,12 +129,12 @@ class ImportedSurface:
         )
 
     @property
-    def clear(self) -> bool:
+    def is_transparent(self) -> bool:
         """Whether all light passes through it, everywhere."""
         color = self.color if self.texture is None else self.texture
         return color is not None and color.shape[-1] == 4 and not color[..., 3].any()
 
-    def same_maps(self, other: ImportedSurface) -> bool:
+    def has_same_maps(self, other: ImportedSurface) -> bool:
         """Return whether two surfaces have equal base colors, normal maps and emission."""
         self_maps = (self.color, self.texture, self.normal_map, self.emission)
         pairs = zip(
@@ -140,26 +148,26 @@ class ImportedSurface:
         )
 
 
-def limited_radiance(
-    factor: Doubles, picture: Floats | None, notes: Notes
-) -> Floats | None:
+def compute_radiance(
+    factor: Float64Array, picture: Float32Array | None, notes: Notes
+) -> Float32Array | None:
     """Return the radiance that a surface emits, as in `ImportedSurface`.
 
     Args:
-        factor: (3,) linear; it is cut to `BRIGHTEST`, with a note.
+        factor: (3,) linear; it is cut to `MAX_RADIANCE`, with a note.
         picture: (H, W, 3) display-referred factors, or None.
         notes: about the file.
     """
-    if factor.max() > BRIGHTEST:
-        notes.say(f"emission brighter than {BRIGHTEST:g} is cut to that")
+    if factor.max() > MAX_RADIANCE:
+        notes.warn(f"emission brighter than {MAX_RADIANCE:g} is cut to that")
     linear = np.ones((1, 1, 3), np.float32)
     if picture is not None:
         linear = srgb_to_linear(picture)
-    radiance = (linear * np.minimum(factor, BRIGHTEST)).astype(np.float32)
+    radiance = (linear * np.minimum(factor, MAX_RADIANCE)).astype(np.float32)
     return radiance if radiance.any() else None
 
 
-def instead_of_texture(color: Floats | None) -> str:
+def describe_substitute(color: Float32Array | None) -> str:
     """Describe the color that replaces a missing texture.
 
     Plain white is no color of a material: it only leaves a texture unchanged.
@@ -169,9 +177,9 @@ def instead_of_texture(color: Floats | None) -> str:
     return f"its base colour ({', '.join(f'{channel:.2f}' for channel in color)})"
 
 
-def with_opacity(
-    color: Floats | None, factor: Floats, cutoff: float | None
-) -> Floats | None:
+def apply_opacity(
+    color: Float32Array | None, factor: Float32Array, cutoff: float | None
+) -> Float32Array | None:
     """Return a base color with its opacity.
 
     Cut-out texels get the nearest visible color, lest theirs bleeds over the edges.
@@ -206,7 +214,7 @@ def with_opacity(
     return np.concatenate([rgb, opacity], axis=-1)
 
 
-def unit(value: float | None) -> float | None:
+def clip_to_unit(value: float | None) -> float | None:
     """Clip a factor to [0, 1]; None and NaN become None."""
     if value is None or math.isnan(value):
         return None
@@ -220,14 +228,16 @@ class ImportedPart:
     None is what the file does not define.
     """
 
-    vertices: Doubles  # (V, 3) positions in the file's axes and units; may hold NaN
-    faces: Ints  # (F, 3) vertices, F > 0
+    vertices: (
+        Float64Array  # (V, 3) positions in the file's axes and units; may hold NaN
+    )
+    faces: IntArray  # (F, 3) vertices, F > 0
     # (V, 3) of the file, not necessarily unit length or finite
-    normals: Doubles | None = None
-    uvs: Doubles | None = None  # (V, 2), v = 0 at the bottom row
+    normals: Float64Array | None = None
+    uvs: Float64Array | None = None  # (V, 2), v = 0 at the bottom row
     # (F, 3, 3) colour of each corner in [0, 1], which multiplies the base colour in
     # linear light
-    colors: Doubles | None = None
+    colors: Float64Array | None = None
     surface: ImportedSurface = ImportedSurface()
     node: int = -1  # index of its node in a glTF file; -1 in others
     # Whether faces without normals are shaded flat; otherwise smooth normals are
@@ -237,21 +247,21 @@ class ImportedPart:
     movable: Movable | None = None
 
 
-def alike(*keys: Ints | Bools) -> list[Ints]:
+def group_faces(*keys: IntArray | BoolArray) -> list[IntArray]:
     """Group faces that have the same values of all keys (F,).
 
     Returns the faces of each combination, in rising order.
     """
     _, group = np.unique(np.stack(keys, axis=1), axis=0, return_inverse=True)
-    return grouped(group.reshape(-1))
+    return group_indices(group.reshape(-1))
 
 
-def visible(parts: Sequence[ImportedPart]) -> list[ImportedPart]:
+def select_visible(parts: Sequence[ImportedPart]) -> list[ImportedPart]:
     """Return the parts that are not fully transparent, or all if that leaves none."""
-    return [part for part in parts if not part.surface.clear] or list(parts)
+    return [part for part in parts if not part.surface.is_transparent] or list(parts)
 
 
-def placed(part: ImportedPart, matrix: Doubles) -> ImportedPart:
+def transform_part(part: ImportedPart, matrix: Float64Array) -> ImportedPart:
     """Return a part transformed by an affine matrix (4, 4)."""
     if np.array_equal(matrix, np.eye(4)):
         return part
@@ -263,18 +273,24 @@ def placed(part: ImportedPart, matrix: Doubles) -> ImportedPart:
             # Normals are transformed by the cofactors of the matrix.
             cofactors = np.cross(linear[[1, 2, 0]], linear[[2, 0, 1]])
             normals = normals @ cofactors.T
-    return put(part, vertices, normals, mirrored=bool(np.linalg.det(linear) < 0.0))
+    return replace_geometry(
+        part, vertices, normals, is_mirrored=bool(np.linalg.det(linear) < 0.0)
+    )
 
 
-def put(
-    part: ImportedPart, vertices: Doubles, normals: Doubles | None, *, mirrored: bool
+def replace_geometry(
+    part: ImportedPart,
+    vertices: Float64Array,
+    normals: Float64Array | None,
+    *,
+    is_mirrored: bool,
 ) -> ImportedPart:
     """Return a part with other vertices and normals.
 
     If it is mirrored, faces are turned over, and normals, which cofactors have flipped.
     """
     part = replace(part, vertices=vertices, normals=normals)
-    if not mirrored:
+    if not is_mirrored:
         return part
     colors = None if part.colors is None else part.colors[:, ::-1]
     return replace(
@@ -285,19 +301,19 @@ def put(
     )
 
 
-class Looked(NamedTuple):
+class IndexedValues(NamedTuple):
     """Values that the corners of triangles look up."""
 
-    values: Doubles  # (N, C) float64
-    at: Ints  # (F, 3) int64 rows of `values`; -1 if a corner has none
+    values: Float64Array  # (N, C) float64
+    rows: IntArray  # (F, 3) int64 rows of `values`; -1 if a corner has none
 
 
 def split_at_corners(
-    chosen: Ints,
-    points: Looked,
-    normals: Looked | None,
-    uvs: Looked | None,
-    colors: Doubles | None,
+    triangles: IntArray,
+    points: IndexedValues,
+    normals: IndexedValues | None,
+    uvs: IndexedValues | None,
+    colors: Float64Array | None,
     surface: ImportedSurface,
     *,
     flat: bool = False,
@@ -307,7 +323,7 @@ def split_at_corners(
     Corners with the same point, normal and texture coordinate become one vertex.
 
     Args:
-        chosen: (T,) the triangles, out of F.
+        triangles: (T,) the triangles, out of F.
         points: (N, 3) values; every corner has a point.
         normals: (N, 3) values.
         uvs: (N, 2) values.
@@ -315,32 +331,32 @@ def split_at_corners(
         surface: as in `ImportedPart`.
         flat: as in `ImportedPart`.
     """
-    key = np.zeros(3 * len(chosen), dtype=np.int64)
+    key = np.zeros(3 * len(triangles), dtype=np.int64)
     n_keys = 1
     for looked_up in filter(None, (points, normals, uvs)):
         count = len(looked_up.values) + 1
         if n_keys * count >= 2**63:  # numbered anew, so that it does not overflow
             key = np.unique(key, return_inverse=True)[1].reshape(-1)
             n_keys = len(key)
-        key = key * count + looked_up.at[chosen].reshape(-1) + 1
+        key = key * count + looked_up.rows[triangles].reshape(-1) + 1
         n_keys *= count
     _, first_corner, faces = np.unique(key, return_index=True, return_inverse=True)
 
-    def values_of_vertices(looked_up: Looked | None) -> Doubles | None:
+    def values_of_vertices(looked_up: IndexedValues | None) -> Float64Array | None:
         if looked_up is None:
             return None
-        rows = looked_up.at[chosen].reshape(-1)[first_corner]
+        rows = looked_up.rows[triangles].reshape(-1)[first_corner]
         if (rows < 0).all():
             return None
         return np.where(rows[:, None] >= 0, looked_up.values[rows], np.nan)
 
-    vertices = points.values[points.at[chosen].reshape(-1)[first_corner]]
+    vertices = points.values[points.rows[triangles].reshape(-1)[first_corner]]
     return ImportedPart(
         vertices,
         faces.reshape(-1, 3),
         values_of_vertices(normals),
         values_of_vertices(uvs),
-        None if colors is None else colors[chosen],
+        None if colors is None else colors[triangles],
         surface,
         flat=flat,
     )

@@ -23,9 +23,9 @@ from advsearch.pictures import (
     opened,
     steps_of,
 )
-from advsearch.scene.assets import Floats
+from advsearch.scene.assets import Float32Array
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.files import Notes, shown
+from advsearch.scene.importing.files import Notes, format_name
 from advsearch.trust.named_files import References, plain_name
 from advsearch.trust.stored_files import LARGEST_FILE, check_most
 
@@ -34,27 +34,27 @@ TEXTURE_LIMIT = 1024
 _BAND = 1 << 22  # pixels of a large picture that are averaged at a time
 
 
-def read_picture(
-    path: Path, limit: int | None = TEXTURE_LIMIT, *, raw: bool = False
-) -> Floats:
-    """Read an image file; arguments and result are those of `display_image`.
+def read_image(
+    path: Path, limit: int | None = TEXTURE_LIMIT, *, is_raw: bool = False
+) -> Float32Array:
+    """Read an image file; arguments and result are those of `load_display_image`.
 
     Raises:
         FileFormatError: the file is missing, no ordinary file, no image, too large or
             corrupt.
     """
     with opened(path, LARGEST_FILE) as image:
-        return display_image(image, limit, path, raw=raw)
+        return load_display_image(image, limit, path, is_raw=is_raw)
 
 
-def display_image(
+def load_display_image(
     image: Image.Image,
     limit: int | None = TEXTURE_LIMIT,
     path: Path | str = "picture",
     *,
-    alpha: bool = False,
-    raw: bool = False,
-) -> Floats:
+    keep_alpha: bool = False,
+    is_raw: bool = False,
+) -> Float32Array:
     """Return an opened image of any mode as display-referred values.
 
     Args:
@@ -62,9 +62,9 @@ def display_image(
         limit: longest side of the result; larger images are averaged down in linear
             light, weighted by opacity. None: no limit.
         path: where it is from, for messages.
-        alpha: keep it as a fourth channel, 1 if the image has none; otherwise it is
+        keep_alpha: keep it as a fourth channel, 1 if the image has none; otherwise it is
             dropped.
-        raw: it holds numbers, as a normal map does, and no colors; larger ones are
+        is_raw: it holds numbers, as a normal map does, and no colors; larger ones are
             averaged down as they are.
 
     Returns:
@@ -81,14 +81,14 @@ def display_image(
         image.load()
         scale = 1.0 if limit is None else limit / max(height, width)
         # Value of each of the 256 levels.
-        display: Floats = np.arange(256, dtype=np.float32) / np.float32(255.0)
+        display: Float32Array = np.arange(256, dtype=np.float32) / np.float32(255.0)
         if scale >= 1.0:
-            return np.asarray(display[steps_of(image, alpha=alpha)])
+            return np.asarray(display[steps_of(image, alpha=keep_alpha)])
         target = max(1, round(height * scale)), max(1, round(width * scale))
-        linear = display if raw else srgb_to_linear(display)
-        is_weighted = not raw and (alpha or image.has_transparency_data)
+        linear = display if is_raw else srgb_to_linear(display)
+        is_weighted = not is_raw and (keep_alpha or image.has_transparency_data)
 
-        def load_band(top: int, end: int) -> Floats:
+        def load_band(top: int, end: int) -> Float32Array:
             band_image = image.crop((0, top, width, end))
             levels = steps_of(band_image, alpha=is_weighted)
             colors = linear[levels[:, :, :3]]
@@ -97,8 +97,8 @@ def display_image(
             opacity = display[levels[:, :, 3:]]
             return np.concatenate([colors, opacity, colors * opacity], axis=2)
 
-        averaged = banded_average(load_band, (height, width), target)
-        if raw:
+        averaged = average_in_bands(load_band, (height, width), target)
+        if is_raw:
             return averaged
         colors = averaged[:, :, :3]
         opacity = averaged[:, :, 3:4]
@@ -106,20 +106,22 @@ def display_image(
             weighted_colors = averaged[:, :, 4:] / np.maximum(opacity, 1e-9)
             colors = np.where(opacity > 0.0, weighted_colors, colors)
         display_colors = linear_to_srgb(colors)
-        if not alpha:
+        if not keep_alpha:
             return display_colors
         return np.concatenate([display_colors, opacity], axis=2)
 
 
-def banded_average(
-    band: Callable[[int, int], Floats], size: tuple[int, int], target: tuple[int, int]
-) -> Floats:
+def average_in_bands(
+    load_band: Callable[[int, int], Float32Array],
+    size: tuple[int, int],
+    target: tuple[int, int],
+) -> Float32Array:
     """Average down an image that is too large to hold in floats.
 
-    The result is that of `area_average` for the full image.
+    The result is that of `average_area` for the full image.
 
     Args:
-        band: returns rows from its first argument to before its second, (n, W, C)
+        load_band: returns rows from its first argument to before its second, (n, W, C)
             float32.
         size: rows and columns of the image.
         target: rows and columns of the result.
@@ -127,46 +129,52 @@ def banded_average(
     Returns:
         (H, W, C) float32.
     """
-    row_weights = _overlaps(size[0], target[0])
-    column_weights = _overlaps(size[1], target[1])
+    row_weights = _compute_overlaps(size[0], target[0])
+    column_weights = _compute_overlaps(size[1], target[1])
     rows_per_band = max(1, _BAND * target[0] // (size[0] * size[1]))
     bands = []
     for start in range(0, target[0], rows_per_band):
         weights = row_weights[start : start + rows_per_band]
         top = int(weights.indices.min())
         end = int(weights.indices.max()) + 1
-        bands.append(_averaged(band(top, end), weights[:, top:end], column_weights))
+        bands.append(_average(load_band(top, end), weights[:, top:end], column_weights))
     return np.concatenate(bands)
 
 
-def area_average(image: Floats, height: int, width: int) -> Floats:
+def average_area(image: Float32Array, height: int, width: int) -> Float32Array:
     """Resample an image (H, W, C) float32 to a smaller size (height, width, C).
 
     Each new pixel is the exact mean over the area that it covers.
     """
-    return _averaged(
-        image, _overlaps(image.shape[0], height), _overlaps(image.shape[1], width)
+    return _average(
+        image,
+        _compute_overlaps(image.shape[0], height),
+        _compute_overlaps(image.shape[1], width),
     )
 
 
-def _averaged(
-    image: Floats, down: sparse.csr_array, across: sparse.csr_array
-) -> Floats:
+def _average(
+    image: Float32Array, row_weights: sparse.csr_array, column_weights: sparse.csr_array
+) -> Float32Array:
     """Average an image (R, C, K) by weights of rows (H, R) and of columns (W, C)."""
     rows, columns, channels = image.shape
-    height = down.shape[0]
-    width = across.shape[0]
-    by_rows = down @ image.reshape(rows, columns * channels)
+    height = row_weights.shape[0]
+    width = column_weights.shape[0]
+    by_rows = row_weights @ image.reshape(rows, columns * channels)
     transposed = (
         by_rows.reshape(height, columns, channels)
         .transpose(1, 0, 2)
         .reshape(columns, height * channels)
     )
-    result = (across @ transposed).reshape(width, height, channels).transpose(1, 0, 2)
+    result = (
+        (column_weights @ transposed)
+        .reshape(width, height, channels)
+        .transpose(1, 0, 2)
+    )
     return np.ascontiguousarray(result, dtype=np.float32)
 
 
-def _overlaps(source: int, target: int) -> sparse.csr_array:
+def _compute_overlaps(source: int, target: int) -> sparse.csr_array:
     """Return the weights (target, source) of source cells in target cells.
 
     They are the overlapping lengths, normalised so that rows sum to 1.
@@ -183,20 +191,20 @@ def _overlaps(source: int, target: int) -> sparse.csr_array:
     return sparse.csr_array(normalization @ weights)
 
 
-Kind = Literal["colours", "colours and alpha", "numbers"]  # what a picture holds
+ImageKind = Literal["colours", "colours and alpha", "numbers"]  # what a picture holds
 LARGEST_SUM = 2 * LARGEST_PIXELS
 """Limit of the pixels of all color textures of a file, and of those of numbers; before
 `scaled`.
 """
 UNREADABLE = "cannot be read as a picture"
-MOST_TEXTURES = 16
+MAX_FULL_TEXTURES = 16
 """Materials whose textures may be as large as `TEXTURE_LIMIT`; more are baked into one map,
 so that smaller ones suffice.
 """
 
 
 @dataclass
-class FilePictures:
+class FileImages:
     """Decodes the images of one file, each once, within limits in total."""
 
     materials: int  # how many the file has
@@ -205,12 +213,14 @@ class FilePictures:
     # Longest side of a texture; None: that of an object with so many materials.
     limit: int | None = None
     # Values, or the reason why there are none, by image and kind.
-    _known: dict[tuple[Hashable, Kind], Floats | str] = field(default_factory=dict)
+    _cache: dict[tuple[Hashable, ImageKind], Float32Array | str] = field(
+        default_factory=dict
+    )
     # Pixels so far, by whether they are numbers.
     _pixels: Counter[bool] = field(default_factory=Counter)
 
     @property
-    def side(self) -> int:
+    def max_side(self) -> int:
         """Longest side of a texture.
 
         The more materials there are the smaller, so that their memory is bounded.
@@ -218,47 +228,51 @@ class FilePictures:
         if self.limit is not None:
             return self.limit
         side = TEXTURE_LIMIT
-        max_texels = MOST_TEXTURES * TEXTURE_LIMIT * TEXTURE_LIMIT
+        max_texels = MAX_FULL_TEXTURES * TEXTURE_LIMIT * TEXTURE_LIMIT
         while side > 64 and self.materials * side * side > max_texels:
             side //= 2
         return side
 
-    def of_file(self, name: str, kind: Kind, words: str) -> Floats | None:
+    def load_file(
+        self, name: str, kind: ImageKind, message: str
+    ) -> Float32Array | None:
         """Return the values of an image that the file names; see `read`."""
-        return self.read(name, lambda: self.references.get(name), kind, name, words)
+        return self.load(name, lambda: self.references.get(name), kind, name, message)
 
-    def read(
+    def load(
         self,
         key: Hashable,
         content: Callable[[], bytes],
-        kind: Kind,
+        kind: ImageKind,
         name: str,
-        words: str,
-    ) -> Floats | None:
-        """Return an image's values, as `display_image`; None, and a note, if it fails.
+        message: str,
+    ) -> Float32Array | None:
+        """Return an image's values, as `load_display_image`; None, and a note, if it fails.
 
         Args:
             key: the same for the same image.
             content: returns its file; raises OSError or ValueError if there is none.
             kind: what it holds.
             name: its name in the file.
-            words: the note, with {name} and {why}.
+            message: the note, with {name} and {why}.
         """
-        if (key, kind) not in self._known:
-            self._known[key, kind] = self._decoded(content, kind, name)
-        values = self._known[key, kind]
+        if (key, kind) not in self._cache:
+            self._cache[key, kind] = self._decode(content, kind, name)
+        values = self._cache[key, kind]
         if not isinstance(values, str):
             return values
-        self.lacks(name, values, words)
+        self.note_missing(name, values, message)
         return None
 
-    def lacks(self, name: str, why: str, words: str) -> None:
+    def note_missing(self, name: str, reason: str, message: str) -> None:
         """Note that an image is missing, and what replaces it."""
-        self.notes.say(words.replace("{name}", shown(name)).replace("{why}", why))
+        self.notes.warn(
+            message.replace("{name}", format_name(name)).replace("{why}", reason)
+        )
 
-    def _decoded(
-        self, content: Callable[[], bytes], kind: Kind, name: str
-    ) -> Floats | str:
+    def _decode(
+        self, content: Callable[[], bytes], kind: ImageKind, name: str
+    ) -> Float32Array | str:
         """Return the values of an image, or the reason why there are none."""
         try:
             image = Image.open(io.BytesIO(content()), formats=FORMATS)
@@ -276,8 +290,12 @@ class FilePictures:
                 "pictures of at most {} pixels",
                 f"{n_pixels:,} in all",
             )
-            texture = display_image(
-                image, self.side, "", alpha=kind == "colours and alpha", raw=is_raw
+            texture = load_display_image(
+                image,
+                self.max_side,
+                "",
+                keep_alpha=kind == "colours and alpha",
+                is_raw=is_raw,
             )
         except FileFormatError as error:
             return f"is not read ({str(error).removeprefix(': ')})"
@@ -286,8 +304,8 @@ class FilePictures:
         self._pixels[is_raw] = n_pixels
         rows, columns = texture.shape[:2]
         if (columns, rows) != (width, height):
-            label = f"the texture {shown(name)}" if name else "a texture"
-            self.notes.say(
+            label = f"the texture {format_name(name)}" if name else "a texture"
+            self.notes.warn(
                 f"{label} of {width:,} x {height:,} texels is averaged "
                 f"down to {columns:,} x {rows:,}"
             )

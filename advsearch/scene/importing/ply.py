@@ -15,27 +15,27 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Doubles, Ints
+from advsearch.scene.assets import Float64Array, IntArray
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
-    MOST_CORNERS,
-    SPLATS,
+    MAX_CORNERS,
+    SPLATS_ADVICE,
     Notes,
+    decode_text,
+    format_name,
     is_number,
-    numbers_in,
-    shown,
-    text_of,
+    parse_number_array,
 )
-from advsearch.scene.importing.geometry import cut_up
+from advsearch.scene.importing.geometry import triangulate_and_note
 from advsearch.scene.importing.parts import (
-    NEUTRAL,
+    NEUTRAL_GREY,
     ImportedPart,
     ImportedSurface,
-    Looked,
-    alike,
+    IndexedValues,
+    group_faces,
     split_at_corners,
 )
-from advsearch.scene.importing.pictures import FilePictures
+from advsearch.scene.importing.pictures import FileImages
 from advsearch.trust.named_files import References
 
 Numbers = npt.NDArray[np.generic]
@@ -65,10 +65,10 @@ _END = re.compile(rb"^end_header[ \t]*(?:\r\n|\n|\r)", re.MULTILINE)
 
 
 @dataclass(frozen=True, eq=False)
-class Lists:
+class ListValues:
     """The values of a list property: several in each row."""
 
-    counts: Ints  # (N,) how many each row has
+    counts: IntArray  # (N,) how many each row has
     values: Numbers  # those of all rows, concatenated
 
 
@@ -81,11 +81,11 @@ class Element:
     # Types of properties; of a list, that of its values.
     types: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
     # Types of the counts of lists.
-    lists: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
+    count_types: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
     # Values (N,) of properties with one in each row.
     scalars: dict[str, Numbers] = field(default_factory=dict)
     # Values of list properties.
-    listed: dict[str, Lists] = field(default_factory=dict)
+    listed: dict[str, ListValues] = field(default_factory=dict)
 
 
 def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[str]]:
@@ -102,7 +102,7 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
     if not has_magic or end is None:
         got = "half of one" if has_magic else data
         raise notes.damaged("a PLY file with a complete header", got)
-    elements, comments, order = _parse_header(text_of(data[: end.start()]), notes)
+    elements, comments, order = _parse_header(decode_text(data[: end.start()]), notes)
     notes.check_faces(elements["face"].count if "face" in elements else 0)
     body = data[end.end() :]
     position = 0
@@ -110,10 +110,10 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
         cells = np.frombuffer(body, np.uint8)
         text = b""
     else:
-        cells = numbers_in(body, np.float64).view(np.uint8)
+        cells = parse_number_array(body, np.float64).view(np.uint8)
         text = body
     for element in elements.values():
-        position = _fill(notes, element, cells, position, text)
+        position = _read_rows(notes, element, cells, position, text)
     return elements, comments
 
 
@@ -140,7 +140,7 @@ def _parse_header(
                 current and counts in _TYPES and kind in _TYPES
             ):
                 current.types[name] = np.dtype((order or "") + _TYPES[kind])
-                current.lists[name] = np.dtype((order or "") + _TYPES[counts])
+                current.count_types[name] = np.dtype((order or "") + _TYPES[counts])
             case ["property", kind, name] if (
                 current and kind in _TYPES and name not in current.types
             ):
@@ -150,7 +150,7 @@ def _parse_header(
             case _:
                 raise notes.damaged(
                     "a PLY header of elements and their properties",
-                    f"the line {shown(line)}",
+                    f"the line {format_name(line)}",
                 )
     if order is None:
         raise notes.damaged(
@@ -159,7 +159,7 @@ def _parse_header(
     return elements, comments, order
 
 
-def _fill(
+def _read_rows(
     notes: Notes,
     element: Element,
     cells: npt.NDArray[np.uint8],
@@ -188,7 +188,9 @@ def _fill(
         return numbers
 
     values = {name: view_from_any_byte(kind) for name, kind in element.types.items()}
-    counts = {name: view_from_any_byte(kind) for name, kind in element.lists.items()}
+    counts = {
+        name: view_from_any_byte(kind) for name, kind in element.count_types.items()
+    }
     # Bytes of a scalar, or of the count of a list.
     widths = {
         name: counts.get(name, numbers).itemsize for name, numbers in values.items()
@@ -196,9 +198,9 @@ def _fill(
 
     def check_end(end: int) -> None:
         if end > len(cells):
-            raise _too_short(notes, element, text)
+            raise _make_length_error(notes, element, text)
 
-    def walk_rows(n_rows: int) -> tuple[dict[str, Ints], int]:
+    def walk_rows(n_rows: int) -> tuple[dict[str, IntArray], int]:
         """Walk through rows one by one.
 
         Returns:
@@ -214,7 +216,9 @@ def _fill(
                 if name in counts:
                     length = counts[name].item(byte)
                     if not 0 <= length <= max_length:
-                        expected = f"lists in the PLY element {shown(element.name)}"
+                        expected = (
+                            f"lists in the PLY element {format_name(element.name)}"
+                        )
                         raise notes.damaged(expected, f"one of {length:g} values")
                     byte += values[name].itemsize * int(length)
                 byte += width
@@ -249,7 +253,9 @@ def _fill(
     return end
 
 
-def _gather_lists(values: Numbers, first_values: Ints, lengths: Ints) -> Lists:
+def _gather_lists(
+    values: Numbers, first_values: IntArray, lengths: IntArray
+) -> ListValues:
     """Return the lists whose first values are at some bytes, (N,), with lengths (N,).
 
     `values` are the numbers that begin at each byte.
@@ -257,29 +263,29 @@ def _gather_lists(values: Numbers, first_values: Ints, lengths: Ints) -> Lists:
     list_starts = np.cumsum(lengths) - lengths
     index_in_list = np.arange(int(lengths.sum())) - np.repeat(list_starts, lengths)
     value_bytes = np.repeat(first_values, lengths) + values.itemsize * index_in_list
-    return Lists(lengths, values[value_bytes])
+    return ListValues(lengths, values[value_bytes])
 
 
-def _too_short(notes: Notes, element: Element, text: bytes) -> FileFormatError:
+def _make_length_error(notes: Notes, element: Element, text: bytes) -> FileFormatError:
     """Return the error for a file that ends within an element."""
-    words = map(text_of, text.split())
+    words = map(decode_text, text.split())
     odd_word = next((word for word in words if not is_number(word)), None)
     got = "fewer; the file is cut short"
     if odd_word is not None:
-        got = f"{shown(odd_word)} among their numbers"
+        got = f"{format_name(odd_word)} among their numbers"
     return notes.damaged(
-        f"{element.count:,} rows of {shown(element.name)}, as the PLY header says",
+        f"{element.count:,} rows of {format_name(element.name)}, as the PLY header says",
         got,
     )
 
 
-COLORS = (
+COLOR_NAMES = (
     ("red", "green", "blue"),
     ("r", "g", "b"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
 )
-ALPHAS = ("alpha", "a", "diffuse_alpha")
-MAPPED = (
+ALPHA_NAMES = ("alpha", "a", "diffuse_alpha")
+UV_NAMES = (
     ("s", "t"),
     ("u", "v"),
     ("texture_u", "texture_v"),
@@ -287,8 +293,8 @@ MAPPED = (
     ("tx", "ty"),
     ("uv1", "uv2"),
 )
-WEDGES = ("texcoord", "texcoords", "texture_coordinates")
-CORNERS = ("vertex_indices", "vertex_index", "vertex_indexes")
+WEDGE_UV_NAMES = ("texcoord", "texcoords", "texture_coordinates")
+CORNER_NAMES = ("vertex_indices", "vertex_index", "vertex_indexes")
 """Names of properties with the same meaning, in the order in which they are tried."""
 _TEXTURE = re.compile(r"texture_?file\s*[:=]?\s+(.*)", re.IGNORECASE)
 
@@ -302,47 +308,51 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """
     elements, comments = read_elements(data, notes)
     reader = _Properties(elements, notes)
-    points = reader.columns("vertex", (("x", "y", "z"),))
+    points = reader.read_columns("vertex", (("x", "y", "z"),))
     if reader.has_splats:
-        notes.say(f" has Gaussian splats, which are left out: a model that {SPLATS}")
+        notes.warn(
+            f" has Gaussian splats, which are left out: a model that {SPLATS_ADVICE}"
+        )
     if points is None:
         if reader.has_splats:
             raise FileFormatError(
                 f"{path}: expected a mesh with faces, got Gaussian "
-                f"splats, a model that {SPLATS}"
+                f"splats, a model that {SPLATS_ADVICE}"
             )
         raise notes.damaged("a PLY file with vertices that have x, y and z", "none")
-    return _make_parts(reader, points, _texture_names(comments))
+    return _make_parts(reader, points, _parse_texture_names(comments))
 
 
 def _make_parts(
-    reader: _Properties, points: Doubles, texture_names: Sequence[str]
+    reader: _Properties, points: Float64Array, texture_names: Sequence[str]
 ) -> list[ImportedPart]:
     """Return the faces of a file as parts, given its points (N, 3) and textures."""
     notes = reader.notes
-    corners, corner_counts = reader.polygons(len(points))
-    triangles, polygon = cut_up(points[corners], corner_counts, notes)
-    position = Looked(points, corners[triangles])
-    normals = reader.columns("vertex", (("nx", "ny", "nz"),))
-    normal = None if normals is None else Looked(normals, position.at)
-    uvs = reader.mapped(corners, corner_counts, triangles)
-    texture = reader.texture_numbers(texture_names, corners, corner_counts)[polygon]
-    colors = reader.colors(position.at, polygon)
+    corners, corner_counts = reader.read_polygons(len(points))
+    triangles, polygon = triangulate_and_note(points[corners], corner_counts, notes)
+    position = IndexedValues(points, corners[triangles])
+    normals = reader.read_columns("vertex", (("nx", "ny", "nz"),))
+    normal = None if normals is None else IndexedValues(normals, position.rows)
+    uvs = reader.read_uvs(corners, corner_counts, triangles)
+    texture = reader.read_texture_indices(texture_names, corners, corner_counts)[
+        polygon
+    ]
+    colors = reader.read_colors(position.rows, polygon)
     # Index -1, of faces without texture, is the last surface.
     surfaces = [
-        *reader.textures(texture_names, plain=colors is None),
+        *reader.make_surfaces(texture_names, has_no_colors=colors is None),
         ImportedSurface(),
     ]
     parts = list[ImportedPart]()
     has_uvs = np.zeros(len(triangles), np.bool_)
     if uvs is not None:
-        has_uvs = np.asarray((uvs.at >= 0).all(axis=1))
-    for group in alike(texture, has_uvs):
+        has_uvs = np.asarray((uvs.rows >= 0).all(axis=1))
+    for group in group_faces(texture, has_uvs):
         surface = surfaces[texture[group[0]]]
         tint = colors
         if colors is not None and surface.texture is not None:
             if colors[group].min() < 1.0:
-                notes.say(
+                notes.warn(
                     "colours of vertices or faces are left out where there is a texture"
                 )
             tint = None
@@ -352,7 +362,7 @@ def _make_parts(
     return parts
 
 
-def _texture_names(comments: Sequence[str]) -> list[str]:
+def _parse_texture_names(comments: Sequence[str]) -> list[str]:
     """Return the names of textures in comments, as MeshLab writes them."""
     names = []
     for comment in comments:
@@ -373,9 +383,9 @@ class _Properties:
         for element in self.elements.values():
             if element.name in ("vertex", "face", "tristrips"):
                 for name in element.types:
-                    self.notes.has(f"{element.name} property", name)
+                    self.notes.record(f"{element.name} property", name)
             elif element.count:
-                self.notes.has("element", element.name)
+                self.notes.record("element", element.name)
 
     @property
     def has_splats(self) -> bool:
@@ -385,23 +395,25 @@ class _Properties:
             properties = self.elements["vertex"].scalars
         return "f_dc_0" in properties or "packed_position" in properties
 
-    def columns(self, element: str, names: Sequence[tuple[str, ...]]) -> Doubles | None:
+    def read_columns(
+        self, element: str, groups: Sequence[tuple[str, ...]]
+    ) -> Float64Array | None:
         """Return the values (N, C) of the first group of properties that is there.
 
         Args:
             element: name of the element.
-            names: groups of C properties each.
+            groups: groups of C properties each.
 
         Returns:
             The values as float64, or None if the element has none of the groups.
         """
-        group = self._find_group(element, "scalars", *names)
+        group = self._find_group(element, "scalars", *groups)
         if not group:
             return None
         scalars = self.elements[element].scalars
         return np.stack([scalars[name].astype(np.float64) for name in group], axis=1)
 
-    def _find_list(self, element: str, names: Sequence[str]) -> Lists | None:
+    def _find_list(self, element: str, names: Sequence[str]) -> ListValues | None:
         """Return the first of several list properties that an element has, or None."""
         group = self._find_group(element, "listed", *((name,) for name in names))
         return self.elements[element].listed[group[0]] if group else None
@@ -417,11 +429,11 @@ class _Properties:
         for group in groups:
             if all(name in properties for name in group):
                 for name in group:
-                    self.notes.take(f"{element} property", name)
+                    self.notes.mark_read(f"{element} property", name)
                 return group
         return ()
 
-    def polygons(self, points: int) -> tuple[Ints, Ints]:
+    def read_polygons(self, points: int) -> tuple[IntArray, IntArray]:
         """Return the polygons of the file: its faces, then the triangles of strips.
 
         Args:
@@ -436,30 +448,32 @@ class _Properties:
                 refers to what is not there.
         """
         face_element = self.elements.get("face")
-        names: tuple[str, ...] = CORNERS
+        names: tuple[str, ...] = CORNER_NAMES
         if face_element is not None:
-            others = [name for name in face_element.listed if name not in WEDGES]
-            names = (*CORNERS, *others)
+            others = [
+                name for name in face_element.listed if name not in WEDGE_UV_NAMES
+            ]
+            names = (*CORNER_NAMES, *others)
         faces = self._find_list("face", names)
-        strips = self._find_list("tristrips", CORNERS)
+        strips = self._find_list("tristrips", CORNER_NAMES)
         corners = np.zeros(0, np.int64)
         counts = np.zeros(0, np.int64)
         if faces is not None:
             corners = _to_integers(faces.values)
             counts = faces.counts
         if strips is not None:
-            triangles = _of_strips(_to_integers(strips.values), strips.counts)
+            triangles = _split_strips(_to_integers(strips.values), strips.counts)
             corners = np.concatenate([corners, triangles.reshape(-1)])
             counts = np.concatenate([counts, np.full(len(triangles), 3)])
         if (counts < 3).all():
             got = "points or lines only; export triangles"
             if self.has_splats:
-                got = f"Gaussian splats, a model that {SPLATS}"
+                got = f"Gaussian splats, a model that {SPLATS_ADVICE}"
             raise FileFormatError(
                 f"{self.notes.path}: expected a mesh with faces, got {got}"
             )
         self.notes.check_most(
-            int(counts.max()), MOST_CORNERS, "faces with at most {} corners"
+            int(counts.max()), MAX_CORNERS, "faces with at most {} corners"
         )
         self.notes.check_faces(int((counts - 2).clip(0).sum()))
         if corners.min() < 0 or corners.max() >= points:
@@ -469,28 +483,30 @@ class _Properties:
             )
         return corners, counts
 
-    def mapped(self, corner: Ints, counts: Ints, triangles: Ints) -> Looked | None:
+    def read_uvs(
+        self, corners: IntArray, counts: IntArray, triangles: IntArray
+    ) -> IndexedValues | None:
         """Return the texture coordinates of triangles, or None if there are none.
 
         Files store them with the corners of faces (wedges), or else with vertices.
 
         Args:
-            corner: (C,) the vertex of each corner of the polygons.
+            corners: (C,) the vertex of each corner of the polygons.
             counts: (P,) how many corners each polygon has.
             triangles: (T, 3) corners.
         """
-        wedges = self._find_list("face", WEDGES)
+        wedges = self._find_list("face", WEDGE_UV_NAMES)
         if wedges is None or not wedges.counts.any():
-            vertex_uvs = self.columns("vertex", MAPPED)
+            vertex_uvs = self.read_columns("vertex", UV_NAMES)
             if vertex_uvs is None:
                 return None
-            return Looked(vertex_uvs, corner[triangles])
+            return IndexedValues(vertex_uvs, corners[triangles])
         # Triangles of strips have no wedges.
         wedge_counts = np.zeros(len(counts), np.int64)
         wedge_counts[: len(wedges.counts)] = wedges.counts
         is_mapped = wedge_counts == 2 * counts
         if not is_mapped[wedge_counts > 0].all():
-            self.notes.say(
+            self.notes.warn(
                 "texture coordinates of faces that are not two for each "
                 "corner are left out"
             )
@@ -500,57 +516,67 @@ class _Properties:
         distinct, index_of_pair = np.unique(
             used.view(np.complex128), return_inverse=True
         )
-        index = np.full(len(corner), -1)
+        index = np.full(len(corners), -1)
         index[np.repeat(is_mapped, counts)] = index_of_pair.reshape(-1)
-        return Looked(distinct.view(np.float64).reshape(-1, 2), index[triangles])
+        return IndexedValues(distinct.view(np.float64).reshape(-1, 2), index[triangles])
 
-    def colors(self, at: Ints, face: Ints) -> Doubles | None:
+    def read_colors(
+        self, vertices: IntArray, polygons: IntArray
+    ) -> Float64Array | None:
         """Return the linear colors (T, 3, 3) of the corners of triangles, or None.
 
         Those of vertices are used, unless these are all the same and those of faces are
         not.
 
         Args:
-            at: (T, 3) vertices of the triangles.
-            face: (T,) polygon of each triangle.
+            vertices: (T, 3) vertices of the triangles.
+            polygons: (T,) polygon of each triangle.
         """
-        vertex_colors = self._element_colors("vertex", at)
-        face_colors = self._element_colors("face", face)
+        vertex_colors = self._read_element_colors("vertex", vertices)
+        face_colors = self._read_element_colors("face", polygons)
         if face_colors is not None:
             face_colors = np.repeat(face_colors[:, None], 3, axis=1)
         if vertex_colors is None or face_colors is None:
             return face_colors if vertex_colors is None else vertex_colors
         if np.ptp(vertex_colors) == 0.0:
-            self.notes.say("colours of vertices are left out: its faces have some, too")
+            self.notes.warn(
+                "colours of vertices are left out: its faces have some, too"
+            )
             return face_colors
-        self.notes.say("colours of faces are left out: its vertices have some, too")
+        self.notes.warn("colours of faces are left out: its vertices have some, too")
         return vertex_colors
 
-    def _element_colors(self, element: str, index: Ints) -> Doubles | None:
+    def _read_element_colors(
+        self, element: str, index: IntArray
+    ) -> Float64Array | None:
         """Return the linear colors (..., 3) of rows of an element, or None."""
-        values = self.columns(element, COLORS)
+        values = self.read_columns(element, COLOR_NAMES)
         if values is None:
             return None
         table = self.elements[element]
-        kind = table.types[self._find_group(element, "scalars", *COLORS)[0]]
-        for name in set(ALPHAS) & set(table.scalars):
+        kind = table.types[self._find_group(element, "scalars", *COLOR_NAMES)[0]]
+        for name in set(ALPHA_NAMES) & set(table.scalars):
             alphas = table.scalars[name].astype(np.float64)
-            is_opaque = not len(alphas) or alphas.min() >= _scale(alphas[:, None], kind)
+            is_opaque = not len(alphas) or alphas.min() >= _find_scale(
+                alphas[:, None], kind
+            )
             if is_opaque:
-                self.notes.take(f"{element} property", name)
-        display = np.clip(np.nan_to_num(values / _scale(values, kind)), 0.0, 1.0)
+                self.notes.mark_read(f"{element} property", name)
+        display = np.clip(np.nan_to_num(values / _find_scale(values, kind)), 0.0, 1.0)
         linear = srgb_to_linear(display.astype(np.float32))
         # Triangles of strips have no row: they are neutral grey.
-        neutral = srgb_to_linear(np.full((1, 3), NEUTRAL, np.float32))
+        neutral = srgb_to_linear(np.full((1, 3), NEUTRAL_GREY, np.float32))
         padded = np.concatenate([linear, neutral])
         return padded[np.minimum(index, len(linear))].astype(np.float64)
 
-    def texture_numbers(self, names: Sequence[str], corner: Ints, counts: Ints) -> Ints:
+    def read_texture_indices(
+        self, names: Sequence[str], corners: IntArray, counts: IntArray
+    ) -> IntArray:
         """Return the index of each polygon's texture, (P,); -1 for none.
 
         Args:
             names: the textures of the file.
-            corner: (C,) the vertex of each corner of the polygons.
+            corners: (C,) the vertex of each corner of the polygons.
             counts: (P,) how many corners each polygon has.
         """
         texture = np.full(len(counts), -1)
@@ -563,49 +589,51 @@ class _Properties:
                 break
         if element is None:
             if len(names) > 1:
-                only = f"of its {len(names)} textures only {shown(names[0])} is used"
-                self.notes.say(f"{only}, as its faces have no texnumber")
+                only = (
+                    f"of its {len(names)} textures only {format_name(names[0])} is used"
+                )
+                self.notes.warn(f"{only}, as its faces have no texnumber")
             return np.zeros(len(counts), np.int64)
         numbers = _to_integers(self.elements[element].scalars["texnumber"])
         if element == "face":
             texture[: len(numbers)] = numbers
         else:
             first_corner = np.cumsum(counts) - counts
-            texture = numbers[corner[np.minimum(first_corner, len(corner) - 1)]]
+            texture = numbers[corners[np.minimum(first_corner, len(corners) - 1)]]
         n_wrong = int(((texture < -1) | (texture >= len(names))).sum())
         if n_wrong:
-            self.notes.say(
+            self.notes.warn(
                 f"{n_wrong:,} faces have a texnumber of a texture that it "
                 "does not name; they have none"
             )
         return np.where((texture >= 0) & (texture < len(names)), texture, -1)
 
-    def textures(self, names: Sequence[str], *, plain: bool) -> list[ImportedSurface]:
+    def make_surfaces(
+        self, names: Sequence[str], *, has_no_colors: bool
+    ) -> list[ImportedSurface]:
         """Return the surface of each texture.
 
-        `plain` is whether the file has no colors that could replace a texture.
+        `has_no_colors` is whether the file has no colors that could replace a texture.
         """
-        pictures = FilePictures(
-            len(names), References(Path(self.notes.path)), self.notes
-        )
+        pictures = FileImages(len(names), References(Path(self.notes.path)), self.notes)
         surfaces = {}
         substitute = "the colours of its vertices or faces are"
-        if plain:
+        if has_no_colors:
             substitute = "neutral grey is"
         for name in dict.fromkeys(names):
             words = (
                 f" names the texture {{name}}, which {{why}}; {substitute} used instead"
             )
-            texture = pictures.of_file(name, "colours and alpha", words)
+            texture = pictures.load_file(name, "colours and alpha", words)
             if texture is not None:
                 if texture[:, :, 3].min() < 1.0:
-                    self.notes.say(f"the alpha of {shown(name)} is left out")
+                    self.notes.warn(f"the alpha of {format_name(name)} is left out")
                 texture = np.ascontiguousarray(texture[:, :, :3])
             surfaces[name] = ImportedSurface(texture=texture, name=name)
         return [surfaces[name] for name in names]
 
 
-def _to_integers(values: npt.NDArray[np.generic]) -> Ints:
+def _to_integers(values: npt.NDArray[np.generic]) -> IntArray:
     """Return values as integers; floats that hold none become -1."""
     if values.dtype.kind == "f":
         numbers = values.astype(np.float64)
@@ -613,7 +641,7 @@ def _to_integers(values: npt.NDArray[np.generic]) -> Ints:
     return values.astype(np.int64)
 
 
-def _scale(values: Doubles, kind: np.dtype[np.generic]) -> float:
+def _find_scale(values: Float64Array, kind: np.dtype[np.generic]) -> float:
     """Return the value of full brightness in colors (N, C) of a type.
 
     It is 1 for floats, unless they are clearly in [0, 255].
@@ -629,7 +657,7 @@ def _scale(values: Doubles, kind: np.dtype[np.generic]) -> float:
     return 2.0 ** (8 * kind.itemsize - is_signed) - 1.0
 
 
-def _of_strips(vertices: Ints, counts: Ints) -> Ints:
+def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:
     """Return the triangles (T, 3) of triangle strips.
 
     Every second triangle of a strip is wound backwards, and vertex -1 starts a new
@@ -646,7 +674,7 @@ def _of_strips(vertices: Ints, counts: Ints) -> Ints:
     strip_start = np.maximum.accumulate(np.where(begins[:-1], index, 0))
     position = index - strip_start
     last = np.flatnonzero((position >= 2) & (vertices >= 0))
-    triangles: Ints = np.stack(
+    triangles: IntArray = np.stack(
         [vertices[last - 2], vertices[last - 1], vertices[last]], axis=1
     )
     is_odd = position[last] % 2 == 1

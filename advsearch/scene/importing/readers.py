@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from advsearch.catalog import list_built_ins
-from advsearch.registry import Registry, imported
+from advsearch.registry import Registry, load_attribute
 from advsearch.scene.importing.files import Notes, read_bytes
 from advsearch.scene.importing.parts import ImportedPart
 
@@ -29,8 +29,8 @@ READERS: Registry[Reader] = Registry(
 
 _CONVERTERS = list_built_ins("converter")
 _READ_AS_GLTF = ("glb", "gltf", "vrm", *_CONVERTERS)
-GLTF = tuple(
-    f".{name}" for name in _READ_AS_GLTF if name in (*READERS.own, *_CONVERTERS)
+GLTF_SUFFIXES = tuple(
+    f".{name}" for name in _READ_AS_GLTF if name in (*READERS.built_ins, *_CONVERTERS)
 )
 """Suffixes of glTF files and of files that are converted to it: y is up, and vertex colors
 are linear.
@@ -39,8 +39,8 @@ are linear.
 
 def list_suffixes() -> tuple[str, ...]:
     """Return the suffixes of mesh files, those of external packages last."""
-    installed = [name for name in READERS if name not in READERS.own]
-    return tuple(f".{name}" for name in (*READERS.own, *_CONVERTERS, *installed))
+    installed = [name for name in READERS if name not in READERS.built_ins]
+    return tuple(f".{name}" for name in (*READERS.built_ins, *_CONVERTERS, *installed))
 
 
 def get_reader(suffix: str) -> Reader:
@@ -59,5 +59,5 @@ def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
     converter = _CONVERTERS.get(path.suffix.lower().removeprefix("."))
     if converter is None:
         return data
-    convert: Callable[[Path, bytes], bytes] = imported(converter.target)
+    convert: Callable[[Path, bytes], bytes] = load_attribute(converter.target)
     return convert(path, data)

@@ -18,51 +18,60 @@ import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import (
-    Doubles,
     FileAxis,
+    Float64Array,
     ObjectAsset,
-    face_vectors,
-    footing,
+    compute_area_vectors,
+    find_footing,
 )
 from advsearch.scene.importing import gltf, gltf_parts
-from advsearch.scene.importing.files import Names, clean, safe_name, shown
-from advsearch.scene.importing.geometry import FLAT, compute_turn
+from advsearch.scene.importing.files import (
+    UniqueNames,
+    format_name,
+    make_safe_name,
+    sanitize_name,
+)
+from advsearch.scene.importing.geometry import MIN_DOUBLED_AREA, compute_rotation
 from advsearch.scene.importing.gltf_entries import (
     GENERATOR,
     CameraEntry,
     Header,
     LightEntry,
 )
-from advsearch.scene.importing.gltf_skeleton import poses
-from advsearch.scene.importing.objects import find_front, object_of, read_parts
-from advsearch.scene.importing.parts import ImportedPart, visible
-from advsearch.scene.importing.readers import GLTF, list_suffixes, read_mesh_bytes
+from advsearch.scene.importing.gltf_skeleton import iterate_poses
+from advsearch.scene.importing.objects import find_front, make_object, read_parts
+from advsearch.scene.importing.parts import ImportedPart, select_visible
+from advsearch.scene.importing.readers import (
+    GLTF_SUFFIXES,
+    list_suffixes,
+    read_mesh_bytes,
+)
 from advsearch.scene.parts import (
-    PlacedCamera,
     PointLamp,
+    PosedCamera,
     ScenePart,
     SpotLamp,
-    mesh_part,
+    make_mesh_part,
 )
-from advsearch.scene.skeleton import with_above
+from advsearch.scene.skeleton import with_ancestors
 
-BEHIND = np.diag([-1.0, 1.0, -1.0])
+GLTF_CAMERA_AXES = np.diag([-1.0, 1.0, -1.0])
 """Rotation (3, 3) between the axes of cameras: glTF's look along -z with +x to the
 right, ours along +z with +x to the left.
 """
-MITSUBA_FILE = ".xml"  # suffix of Mitsuba's scenes
+MITSUBA_SUFFIX = ".xml"  # suffix of Mitsuba's scenes
 LUMENS = 683.0
 """Lumens of a watt, at 555 nm. Blender's exporter multiplies the power of lights by it,
 but no emission.
 """
 # Limit of the distance of a light or camera in object sizes, and of the radiant
 # intensity of a light.
-FURTHEST = 1e12
-SQUARE = 1e-3  # largest cosine of the angle between two axes of a camera
+MAX_DISTANCE = 1e12
+MAX_AXIS_COSINE = 1e-3  # largest cosine of the angle between two axes of a camera
 # Largest field of view of a camera along the larger side of its image, degrees.
-WIDEST_VIEW = 170.0
-MOST_SURROUNDINGS = 200  # meshes and lamps around an object
-TAKEN = frozenset(("object", "environment", "ground", "camera", "orbit"))
+MAX_FOV = 170.0
+MAX_SURROUNDINGS = 200  # meshes and lamps around an object
+RESERVED_NAMES = frozenset(("object", "environment", "ground", "camera", "orbit"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +80,12 @@ class ImportedScene:
 
     object: ObjectAsset  # the requested node, with all its descendants
     surroundings: tuple[ScenePart, ...] = ()  # the other meshes, and lamps
-    cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)  # by name
+    cameras: Mapping[str, PosedCamera] = field(default_factory=dict)  # by name
 
 
 def split_node(spec: str) -> tuple[str, str | None]:
     """Split ``scene.glb#chair`` into the file and the node, None if none is named."""
-    suffixes = "|".join(map(re.escape, (*GLTF, MITSUBA_FILE)))
+    suffixes = "|".join(map(re.escape, (*GLTF_SUFFIXES, MITSUBA_SUFFIX)))
     match = re.fullmatch(rf"(.+({suffixes}))#(.*)", spec, re.IGNORECASE | re.DOTALL)
     if match is None or os.path.exists(spec):
         return spec, None
@@ -103,11 +112,11 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         InputError: as for `import_object`; or several nodes have the name; or there are
             too many other meshes and lights.
     """
-    data = read_mesh_bytes(path, "scene", GLTF)
+    data = read_mesh_bytes(path, "scene", GLTF_SUFFIXES)
     header = gltf.read_header(path, data)
     parts, notes = read_parts(path, data)
-    node_poses = dict(poses(header))
-    object_nodes = header.below([_find_node(path, header, parts, node)])
+    node_poses = dict(iterate_poses(header))
+    object_nodes = header.find_descendants([_find_node(path, header, parts, node)])
     object_parts = [part for part in parts if part.node in object_nodes]
     lights = {
         index: header.lights[light_index]
@@ -117,28 +126,37 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     n_others = len({part.node for part in parts} - object_nodes)
     _check_surroundings(path, n_others + len(lights))
     front = find_front(path, header)
-    turn = compute_turn("y", front.axis)
-    frame = _frame(object_parts, turn)
-    names = Names(TAKEN)
+    turn = compute_rotation("y", front.axis)
+    frame = _compute_frame(object_parts, turn)
+    names = UniqueNames(RESERVED_NAMES)
     surroundings: list[ScenePart] = []
-    for index, name in _mesh_names(header, parts, names).items():
+    for index, name in _make_mesh_names(header, parts, names).items():
         if index not in object_nodes:
             node_parts = [part for part in parts if part.node == index]
-            part, warnings = _surrounding_mesh(path, name, node_parts, front, frame)
+            part, warnings = _make_surrounding_mesh(
+                path, name, node_parts, front, frame
+            )
             surroundings.append(part)
             notes.extend(warnings)
-    candela, reason = _unit_of_light(header, parts, bool(lights))
+    candela, reason = _find_light_unit(header, parts, bool(lights))
     notes.extend([f"{path.name}: {reason}"] if reason else [])
     for index, light in lights.items():
-        name = names.free(light.name or header.label(index))
-        surroundings.append(_lamp(path, name, light, candela, node_poses[index], frame))
+        name = names.make_unique(light.name or header.get_label(index))
+        surroundings.append(
+            _make_lamp(path, name, light, candela, node_poses[index], frame)
+        )
     cameras = {}
-    for index, name in _camera_names(header, node_poses).items():
+    for index, name in _make_camera_names(header, node_poses).items():
         camera = header.cameras[header.nodes[index].camera or 0]
-        cameras[name] = _camera(path, name, camera, node_poses[index], frame)
-    notes.extend(gltf_parts.lights_and_cameras(header, path.name))
-    asset = object_of(
-        object_parts, notes, path, f"{safe_name(path)}-{clean(node)}", "y", front
+        cameras[name] = _make_camera(path, name, camera, node_poses[index], frame)
+    notes.extend(gltf_parts.describe_changed_lights(header, path.name))
+    asset = make_object(
+        object_parts,
+        notes,
+        path,
+        f"{make_safe_name(path)}-{sanitize_name(node)}",
+        "y",
+        front,
     )
     return ImportedScene(asset, tuple(surroundings), cameras)
 
@@ -152,8 +170,8 @@ def _find_node(
         UnknownNameError: there is none.
         InputError: there are several.
     """
-    candidates = sorted(with_above(header.parents, {part.node for part in parts}))
-    labels = {index: header.label(index) for index in candidates}
+    candidates = sorted(with_ancestors(header.parents, {part.node for part in parts}))
+    labels = {index: header.get_label(index) for index in candidates}
     matches = [
         index for index, label in labels.items() if name in (label, f"node {index}")
     ]
@@ -163,21 +181,21 @@ def _find_node(
     if len(matches) > 1:
         choices = ", ".join(f"{path.name}#node {index}" for index in matches[:10])
         raise InputError(
-            f"{path}: {len(matches)} nodes are called {shown(name)}; say which: "
+            f"{path}: {len(matches)} nodes are called {format_name(name)}; say which: "
             f"{choices}"
         )
     return matches[0]
 
 
 def _check_surroundings(path: Path, count: int) -> None:
-    if count > MOST_SURROUNDINGS:
-        limit = f"at most {MOST_SURROUNDINGS} meshes and lights beside the object"
+    if count > MAX_SURROUNDINGS:
+        limit = f"at most {MAX_SURROUNDINGS} meshes and lights beside the object"
         raise InputError(
             f"{path}: expected {limit}, got {count}; join some of them in the file"
         )
 
 
-def _surrounding_mesh(
+def _make_surrounding_mesh(
     path: Path,
     name: str,
     parts: list[ImportedPart],
@@ -185,15 +203,15 @@ def _surrounding_mesh(
     object_frame: FileFrame,
 ) -> tuple[ScenePart, tuple[str, ...]]:
     """Return one node's parts as a scene part around the object, and the warnings."""
-    frame = _frame(parts, object_frame.turn)
-    shape = object_of(parts, [], path, name, "y", front)
+    frame = _compute_frame(parts, object_frame.turn)
+    shape = make_object(parts, [], path, name, "y", front)
     matrix = np.eye(4)
     matrix[:3, :3] *= frame.size / object_frame.size
-    matrix[:3, 3] = object_frame.inside(frame.origin)
-    return mesh_part(shape.name, shape, matrix, shape.material), shape.warnings
+    matrix[:3, 3] = object_frame.to_frame(frame.origin)
+    return make_mesh_part(shape.name, shape, matrix, shape.material), shape.warnings
 
 
-def node_names(path: Path) -> list[str]:
+def list_node_names(path: Path) -> list[str]:
     """Return the node names that `import_scene` accepts for a glTF file.
 
     A name that several nodes have is listed once.
@@ -201,31 +219,31 @@ def node_names(path: Path) -> list[str]:
     Raises:
         FileFormatError: as for `import_object`.
     """
-    header = gltf.read_header(path, read_mesh_bytes(path, "scene", GLTF))
+    header = gltf.read_header(path, read_mesh_bytes(path, "scene", GLTF_SUFFIXES))
     with_mesh = {
         index for index, node in enumerate(header.nodes) if node.mesh is not None
     }
-    candidates = sorted(with_above(header.parents, with_mesh))
-    return list(dict.fromkeys(map(header.label, candidates)))
+    candidates = sorted(with_ancestors(header.parents, with_mesh))
+    return list(dict.fromkeys(map(header.get_label, candidates)))
 
 
-def _mesh_names(
-    header: Header, parts: Sequence[ImportedPart], names: Names
+def _make_mesh_names(
+    header: Header, parts: Sequence[ImportedPart], names: UniqueNames
 ) -> dict[int, str]:
     """Return a unique name for each node with parts, by the node's index."""
     nodes = sorted({part.node for part in parts})
-    return {node: names.free(header.label(node)) for node in nodes}
+    return {node: names.make_unique(header.get_label(node)) for node in nodes}
 
 
-def _camera_names(header: Header, nodes: Iterable[int]) -> dict[int, str]:
+def _make_camera_names(header: Header, nodes: Iterable[int]) -> dict[int, str]:
     """Return a unique name for each node with a perspective camera, by index."""
-    names = Names(TAKEN)
+    names = UniqueNames(RESERVED_NAMES)
     name_of_node = {}
     for index in sorted(nodes):
         camera = header.nodes[index].camera
         if camera is not None and header.cameras[camera].perspective is not None:
-            label = header.cameras[camera].name or header.label(index)
-            name_of_node[index] = names.free(label)
+            label = header.cameras[camera].name or header.get_label(index)
+            name_of_node[index] = names.make_unique(label)
     return name_of_node
 
 
@@ -234,7 +252,7 @@ class NodeContents:
     """A node with geometry."""
 
     name: str  # that `import_scene` accepts
-    mesh: str  # its name in controls if another node is the object
+    mesh_name: str  # its name in controls if another node is the object
     triangles: int  # number of them in its own mesh
     # Bounding box in the file's axes and units, (3,).
     size: tuple[float, float, float]
@@ -260,31 +278,31 @@ def contents(path: Path) -> Contents:
         FileFormatError: as for `import_object`.
         InputError: as for `import_object`.
     """
-    data = read_mesh_bytes(path, "object", (*list_suffixes(), MITSUBA_FILE))
+    data = read_mesh_bytes(path, "object", (*list_suffixes(), MITSUBA_SUFFIX))
     parts, notes = read_parts(path, data)
-    name = safe_name(path)
-    if path.suffix.lower() not in GLTF:
+    name = make_safe_name(path)
+    if path.suffix.lower() not in GLTF_SUFFIXES:
         front = find_front(path, None)
-        return Contents(object_of(parts, notes, path, name, None, front))
+        return Contents(make_object(parts, notes, path, name, None, front))
     header = gltf.read_header(path, data)
-    notes += gltf_parts.lights_and_cameras(header, path.name)
-    asset = object_of(parts, notes, path, name, "y", find_front(path, header))
+    notes += gltf_parts.describe_changed_lights(header, path.name)
+    asset = make_object(parts, notes, path, name, "y", find_front(path, header))
     parts_of_node: dict[int, list[ImportedPart]] = {}
     for part in parts:
         parts_of_node.setdefault(part.node, []).append(part)
-    mesh_names = _mesh_names(header, parts, Names(TAKEN))
+    mesh_names = _make_mesh_names(header, parts, UniqueNames(RESERVED_NAMES))
     nodes = [
-        _node_contents(header.label(index), mesh_names[index], parts_of_node[index])
+        _measure_node(header.get_label(index), mesh_names[index], parts_of_node[index])
         for index in sorted(parts_of_node)
     ]
     lights = [
         light.name or f"light {index}" for index, light in enumerate(header.lights)
     ]
-    cameras = _camera_names(header, dict(poses(header))).values()
+    cameras = _make_camera_names(header, dict(iterate_poses(header))).values()
     return Contents(asset, tuple(nodes), tuple(lights), tuple(cameras))
 
 
-def _node_contents(
+def _measure_node(
     name: str, mesh_name: str, parts: Sequence[ImportedPart]
 ) -> NodeContents:
     """Measure the parts of one node."""
@@ -305,25 +323,25 @@ class FileFrame:
     """
 
     size: float
-    origin: Doubles
-    turn: Doubles  # (3, 3) from the file's axes to ours
+    origin: Float64Array
+    turn: Float64Array  # (3, 3) from the file's axes to ours
 
-    def inside(self, places: Doubles) -> Doubles:
+    def to_frame(self, points: Float64Array) -> Float64Array:
         """Return points (..., 3) of the file, in our axes, in this frame."""
-        return np.asarray((places - self.origin) / self.size)
+        return np.asarray((points - self.origin) / self.size)
 
 
-def _frame(parts: Sequence[ImportedPart], turn: Doubles) -> FileFrame:
+def _compute_frame(parts: Sequence[ImportedPart], turn: Float64Array) -> FileFrame:
     """Return the frame in which parts have extent 1, stand on z = 0 and are centred.
 
     The largest extent is meant; parts are centred in x and y.
     """
     corners = []
-    for part in visible(parts):
+    for part in select_visible(parts):
         triangles = part.vertices[part.faces]
-        area = np.linalg.norm(face_vectors(triangles), axis=1)
+        area = np.linalg.norm(compute_area_vectors(triangles), axis=1)
         extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
-        corners.append(triangles[area > FLAT * extent**2].reshape(-1, 3))
+        corners.append(triangles[area > MIN_DOUBLED_AREA * extent**2].reshape(-1, 3))
     points = np.concatenate(corners) @ turn.T
     is_valid = (
         np.isfinite(points).all() and len(points) and np.ptp(points, axis=0).max() > 0.0
@@ -331,11 +349,11 @@ def _frame(parts: Sequence[ImportedPart], turn: Doubles) -> FileFrame:
     if not is_valid:
         # The repair of the geometry rejects it with a reason.
         return FileFrame(1.0, np.zeros(3), turn)
-    origin, size = footing(points)
+    origin, size = find_footing(points)
     return FileFrame(size, origin, turn)
 
 
-def _unit_of_light(
+def _find_light_unit(
     header: Header, parts: Sequence[ImportedPart], has_lights: bool
 ) -> tuple[float, str]:
     """Return how many candela are one unit of radiant intensity, and a note on it.
@@ -362,12 +380,12 @@ def _unit_of_light(
     )
 
 
-def _lamp(
+def _make_lamp(
     path: Path,
     name: str,
     light: LightEntry,
     candela: float,
-    pose: Doubles,
+    pose: Float64Array,
     frame: FileFrame,
 ) -> PointLamp | SpotLamp:
     """Return a light of a file as a lamp.
@@ -387,15 +405,15 @@ def _lamp(
     if light.type == "directional":
         direction = frame.turn @ pose[:3, 2]  # it shines along its -z
         length = max(float(np.linalg.norm(direction)), 1e-12)
-        position = gltf_parts.FAR * direction / length
-        intensity = intensity * gltf_parts.FAR**2
+        position = gltf_parts.DIRECTIONAL_LIGHT_DISTANCE * direction / length
+        intensity = intensity * gltf_parts.DIRECTIONAL_LIGHT_DISTANCE**2
     else:
-        position = frame.inside(frame.turn @ pose[:3, 3])
+        position = frame.to_frame(frame.turn @ pose[:3, 3])
         intensity = intensity / frame.size**2
-    is_in_range = np.abs([*position, *intensity]) <= FURTHEST  # NaN is not
+    is_in_range = np.abs([*position, *intensity]) <= MAX_DISTANCE  # NaN is not
     if not is_in_range.all():
         raise InputError(
-            f"{path}: expected the light {name} within {FURTHEST:g} object sizes, and "
+            f"{path}: expected the light {name} within {MAX_DISTANCE:g} object sizes, and "
             "no brighter than that, got "
             "more; correct its place or its intensity, or remove it"
         )
@@ -416,9 +434,9 @@ def _lamp(
     )
 
 
-def _camera(
-    path: Path, name: str, camera: CameraEntry, pose: Doubles, frame: FileFrame
-) -> PlacedCamera:
+def _make_camera(
+    path: Path, name: str, camera: CameraEntry, pose: Float64Array, frame: FileFrame
+) -> PosedCamera:
     """Return a perspective camera of a file, whose node has a pose (4, 4).
 
     Raises:
@@ -426,32 +444,30 @@ def _camera(
             field of view.
     """
     assert camera.perspective is not None
-    axes = frame.turn @ pose[:3, :3] @ BEHIND
+    axes = frame.turn @ pose[:3, :3] @ GLTF_CAMERA_AXES
     axes = axes / np.maximum(np.linalg.norm(axes, axis=0), 1e-12)
     matrix = np.eye(4)
     matrix[:3, :3] = axes
-    matrix[:3, 3] = frame.inside(frame.turn @ pose[:3, 3])
+    matrix[:3, 3] = frame.to_frame(frame.turn @ pose[:3, 3])
     # Without one, the aspect ratio is that of the image (section 5.13).
     aspect_ratio = camera.perspective.aspectRatio
     half_height = math.tan(camera.perspective.yfov / 2.0)
     fov = math.degrees(2.0 * math.atan(half_height * max(aspect_ratio or 1.0, 1.0)))
     is_mirrored = np.linalg.det(axes) < 0.0
-    if not (np.abs(matrix[:3, 3]) <= FURTHEST).all():  # NaN is not
-        problem = f"within {FURTHEST:g} object sizes, got more; correct its place"
+    if not (np.abs(matrix[:3, 3]) <= MAX_DISTANCE).all():  # NaN is not
+        problem = f"within {MAX_DISTANCE:g} object sizes, got more; correct its place"
     elif not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
         problem = (
             "to look somewhere, got axes without length; correct the scale of its node"
         )
-    elif not np.allclose(axes.T @ axes, np.eye(3), atol=SQUARE) or is_mirrored:
+    elif not np.allclose(axes.T @ axes, np.eye(3), atol=MAX_AXIS_COSINE) or is_mirrored:
         got = "mirrored" if is_mirrored else "sheared"
         advice = "apply the scale of the nodes above it (in Blender Ctrl A)"
         problem = f"under nodes that turn, move and scale it, got {got} axes; {advice}"
-    elif not 0.0 < fov <= WIDEST_VIEW:
+    elif not 0.0 < fov <= MAX_FOV:
         problem = (
-            f"with a field of view up to {WIDEST_VIEW:g} degrees, got "
-            f"{fov:.4g}; "
-            "correct it"
+            f"with a field of view up to {MAX_FOV:g} degrees, got {fov:.4g}; correct it"
         )
     else:
-        return PlacedCamera(matrix, fov, upright=aspect_ratio is None)
+        return PosedCamera(matrix, fov, upright=aspect_ratio is None)
     raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")

@@ -11,23 +11,23 @@ import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import (
-    Doubles,
+    Float64Array,
 )
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import Notes, looks_like, text_of
-from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface
+from advsearch.scene.importing.files import Notes, decode_text, describe_content
+from advsearch.scene.importing.parts import NEUTRAL_GREY, ImportedPart, ImportedSurface
 
 Attributes = npt.NDArray[np.uint16]
-_FACET = np.dtype(
+_FACET_DTYPE = np.dtype(
     [("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attribute", "<u2")]
 )
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
-_NAMED = re.compile(
+_NAME_LINE = re.compile(
     rb"^[ \t]*(?:end[ \t]?)?solid\b(?:(?!facet\s+normal)[^\n])*",
     re.IGNORECASE | re.MULTILINE,
 )
 _WORDS = frozenset("facet outer vertex endloop endfacet end".split())
-_OWN = 0x8000
+_COLOR_FLAG = 0x8000
 
 
 def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
@@ -46,16 +46,16 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     surface = ImportedSurface()
     if len(data) == expected_size:
         notes.check_faces((expected_size - 84) // 50)
-        facets = np.frombuffer(data, _FACET, offset=84)
+        facets = np.frombuffer(data, _FACET_DTYPE, offset=84)
         points = facets["vertices"].astype(np.float64).reshape(-1, 3)
-        colors = _colors(data[:80], facets["attribute"], notes)
+        colors = _read_colors(data[:80], facets["attribute"], notes)
         if colors is not None:
             corner_colors = np.repeat(colors[:, None], 3, axis=1)
             surface = ImportedSurface(color=np.ones(3, np.float32))
     elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
-        points = _of_text(data, notes)
+        points = _parse_text(data, notes)
     else:
-        got = looks_like(data)
+        got = describe_content(data)
         if "another" in got:
             got = f"{len(data)} bytes, which is neither ASCII nor that long"
         raise notes.damaged(
@@ -70,14 +70,14 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     return [ImportedPart(points, faces, None, None, corner_colors, surface)]
 
 
-def _of_text(data: bytes, notes: Notes) -> Doubles:
+def _parse_text(data: bytes, notes: Notes) -> Float64Array:
     """Return the points (3 F, 3) of an ASCII file."""
     if not re.search(rb"\bend\s?solid", data, re.IGNORECASE):
         raise notes.damaged(
             "an ASCII STL file that ends in 'endsolid'", "one that is cut short"
         )
     # Names may have any words.
-    data = _NAMED.sub(b"", data.replace(b"\r", b"\n"))
+    data = _NAME_LINE.sub(b"", data.replace(b"\r", b"\n"))
     vertices = _VERTEX.findall(data)
     notes.check_faces(len(vertices) // 3)
     n_loops = len(re.findall(rb"\bouter\s+loop\b", data, re.IGNORECASE))
@@ -92,12 +92,14 @@ def _of_text(data: bytes, notes: Notes) -> Doubles:
             "three numbers after each 'vertex'", "something else"
         ) from None
     for word in re.findall(rb"^[ \t]*([^\s\d]\S*)", data, re.MULTILINE):
-        if text_of(word).lower() not in _WORDS:
-            notes.has("statement", text_of(word))
+        if decode_text(word).lower() not in _WORDS:
+            notes.record("statement", decode_text(word))
     return points.reshape(-1, 3)
 
 
-def _colors(head: bytes, attributes: Attributes, notes: Notes) -> Doubles | None:
+def _read_colors(
+    head: bytes, attributes: Attributes, notes: Notes
+) -> Float64Array | None:
     """Return the linear color of each facet, (F, 3), or None if there are none.
 
     Two programs store them with 5 bits for each channel. Magics writes ``COLOR=`` and
@@ -115,18 +117,18 @@ def _colors(head: bytes, attributes: Attributes, notes: Notes) -> Doubles | None
     colors = np.stack(channels, axis=1).astype(np.float32) / np.float32(31.0)
     if 0 <= magics <= 70:
         if b"MATERIAL=" in head:
-            notes.has("header entry", "MATERIAL")
-        has_color = (attributes & _OWN == 0) & bool(attributes.any())
+            notes.record("header entry", "MATERIAL")
+        has_color = (attributes & _COLOR_FLAG == 0) & bool(attributes.any())
         colors = colors[:, ::-1]
         default = np.frombuffer(head, np.uint8, 3, magics + 6) / np.float32(255.0)
         if 0 < head[magics + 9] < 255:
-            notes.has("opacity of its header entry", "COLOR")
+            notes.record("opacity of its header entry", "COLOR")
     else:
-        has_color = attributes & _OWN != 0
-        default = np.full(3, NEUTRAL, np.float32)
+        has_color = attributes & _COLOR_FLAG != 0
+        default = np.full(3, NEUTRAL_GREY, np.float32)
         if not has_color.any():
             if attributes.any():
-                notes.has(
+                notes.record(
                     "attribute bytes of its facets, which are no colours known here,",
                     f"{attributes.max():#06x}",
                 )

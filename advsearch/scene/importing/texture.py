@@ -14,30 +14,43 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
-from advsearch.scene.assets import Doubles, Floats, Ints, grouped
+from advsearch.scene.assets import Float32Array, Float64Array, IntArray, group_indices
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import Notes
-from advsearch.scene.importing.geometry import Soup, connected, unit_vectors
-from advsearch.scene.importing.parts import FLAT, NEUTRAL, ImportedSurface, texels_of
+from advsearch.scene.importing.geometry import Soup, find_components, normalize_vectors
+from advsearch.scene.importing.parts import (
+    FLAT_TEXEL,
+    NEUTRAL_GREY,
+    ImportedSurface,
+    encode_normals,
+)
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT
-from advsearch.scene.raster import doubled_areas, looked_up, pixels_in
-from advsearch.scene.surface_parts import unwrapped
+from advsearch.scene.raster import (
+    compute_doubled_areas,
+    look_up_texture,
+    rasterize_triangles,
+)
+from advsearch.scene.surface_parts import unwrap
 
 # Width and height, in texels, of the base color map of an object of one color.
 PLAIN_SIZE = 8
 BAKED_SIZE = 512  # width and height of the smallest base color map that is baked
-_SLACK = 1e-4  # how far UVs may overstep [0, 1] and still be clipped
-_SQUASHED = 0.05  # fraction of the surface that may have no area in UV space
-_CRAMPED = 0.02  # fraction of the unit square that UVs must cover in all
-_WINDOW = 1.5  # how many textures wide and high UVs may be and still keep their layout
-_BORDER = 2.0  # texels outside a chart up to which it emits light: filtering needs them
-_SHARED = 0.005  # fraction of the texels that may be on several faces
+_UV_TOLERANCE = 1e-4  # how far UVs may overstep [0, 1] and still be clipped
+_MAX_SQUASHED = 0.05  # fraction of the surface that may have no area in UV space
+_MIN_UV_AREA = 0.02  # fraction of the unit square that UVs must cover in all
+_MAX_WINDOW = (
+    1.5  # how many textures wide and high UVs may be and still keep their layout
+)
+_EMISSION_BORDER = (
+    2.0  # texels outside a chart up to which it emits light: filtering needs them
+)
+_MAX_SHARED = 0.005  # fraction of the texels that may be on several faces
 # How many times more texels an image may have than a baked texture without a note.
-_FINER = 1.5
+_MAX_TEXEL_RATIO = 1.5
 # Limits of the points at which a mean is sampled, and of the steps along a face's side.
-_LOOKS = 1 << 18
-_FINEST = 256
-_FILLED = 0.5  # approximate fraction of an atlas that its charts fill
+_MAX_SAMPLES = 1 << 18
+_MAX_STEPS = 256
+_FILL_FRACTION = 0.5  # approximate fraction of an atlas that its charts fill
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +58,13 @@ class SurfaceMaps:
     """The images of an object's surface; row 0 is on top, at v = 1."""
 
     # (H, W, 3) display-referred base color in [0, 1], or (H, W, 4) with the opacity.
-    color: Floats
-    normals: Floats | None = None  # (H', W', 3) as `ImportedSurface.normal_map`
+    color: Float32Array
+    normals: Float32Array | None = None  # (H', W', 3) as `ImportedSurface.normal_map`
     # (H", W", 3) linear radiance, or (1, 1, 3) if it is the same everywhere.
-    emission: Floats | None = None
+    emission: Float32Array | None = None
 
 
-def textured(
+def apply_textures(
     soup: Soup, surfaces: Sequence[ImportedSurface], notes: Notes
 ) -> tuple[Soup, SurfaceMaps]:
     """Give every corner of a repaired soup UVs in [0, 1], and make the maps that fit.
@@ -68,64 +81,64 @@ def textured(
     first = used[0]
     is_uniform = all(surface.same_maps(first) for surface in used)
     has_one_factor = bool((soup.colors == soup.colors[0, 0]).all())
-    _, material = by_material(soup, surfaces)
+    _, material = index_materials(soup, surfaces)
     is_lit_twice = False
     if is_uniform and has_one_factor:
         if not first.pictures:
-            return _without_images(soup, first, material)
+            return _texture_plain(soup, first, material)
         is_untinted = first.texture is None or soup.colors.min() == 1.0
         if is_untinted and np.isfinite(soup.uvs).all():
-            uvs, images = _windowed(
-                _into_unit_square(soup), first.pictures, first.texture
+            uvs, images = _crop_to_window(
+                _move_into_unit_square(soup), first.pictures, first.texture
             )
-            is_usable = _usable(soup, uvs)
-            is_lit_twice = is_usable and _lit_twice(uvs, first, images)
+            is_usable = _is_usable(soup, uvs)
+            is_lit_twice = is_usable and _is_lit_twice(uvs, first, images)
             if is_usable and not is_lit_twice:
-                return _with_images(soup, uvs, first.with_pictures(images))
-    unwrapped_soup = unwrapped(soup, material)
-    maps = baked(unwrapped_soup.uvs, soup, surfaces)
+                return _texture_with_images(soup, uvs, first.with_pictures(images))
+    unwrapped_soup = unwrap(soup, material)
+    maps = bake(unwrapped_soup.uvs, soup, surfaces)
     reason = (
         "several faces share a texture that emits light; it was unwrapped anew "
         "and its texture resampled"
     )
     if not is_lit_twice:
-        reason = _why(soup, used, is_uniform, has_one_factor)
+        reason = _describe_reason(soup, used, is_uniform, has_one_factor)
     size = len(maps.color)
-    ratio = _texels(soup, surfaces) / (size * size * _FILLED)
+    ratio = _count_texels(soup, surfaces) / (size * size * _FILL_FRACTION)
     fewer = ""
-    if ratio >= _FINER:
+    if ratio >= _MAX_TEXEL_RATIO:
         fewer = f", {ratio:.0f} times fewer than its pictures have there"
-    notes.say(f"{reason} ({size} x {size} texels{fewer})")
+    notes.warn(f"{reason} ({size} x {size} texels{fewer})")
     return unwrapped_soup, maps
 
 
-def _without_images(
-    soup: Soup, surface: ImportedSurface, material: Ints
+def _texture_plain(
+    soup: Soup, surface: ImportedSurface, material: IntArray
 ) -> tuple[Soup, SurfaceMaps]:
     """Return a soup of one color with UVs, the file's if they do not overlap."""
-    keeps_uvs = _usable(soup, soup.uvs) and not _overlap(soup.uvs, material)
+    keeps_uvs = _is_usable(soup, soup.uvs) and not _has_overlap(soup.uvs, material)
     if keeps_uvs:
         soup_with_uvs = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0))
     else:
-        soup_with_uvs = unwrapped(soup, material)
-    color = _of_one_color(soup_with_uvs, surface)
+        soup_with_uvs = unwrap(soup, material)
+    color = _make_plain_map(soup_with_uvs, surface)
     return soup_with_uvs, SurfaceMaps(color, None, surface.emission)
 
 
-def _with_images(
-    soup: Soup, uvs: Doubles, surface: ImportedSurface
+def _texture_with_images(
+    soup: Soup, uvs: Float64Array, surface: ImportedSurface
 ) -> tuple[Soup, SurfaceMaps]:
     """Return a soup with the images of its only surface, for UVs (F, 3, 2)."""
     color = surface.texture
     if color is None:
-        color = _of_one_color(soup, surface)
+        color = _make_plain_map(soup, surface)
     maps = SurfaceMaps(color, surface.normal_map, surface.emission)
-    return _unmirrored(soup, np.clip(uvs, 0.0, 1.0), maps)
+    return _unmirror(soup, np.clip(uvs, 0.0, 1.0), maps)
 
 
-def by_material(
+def index_materials(
     soup: Soup, surfaces: Sequence[ImportedSurface]
-) -> tuple[list[str], Ints]:
+) -> tuple[list[str], IntArray]:
     """Return the names of materials, "" for none, and the index of each face's (F,)."""
     names = list(dict.fromkeys(surface.name for surface in surfaces))
     index_of_name = {name: index for index, name in enumerate(names)}
@@ -133,30 +146,32 @@ def by_material(
     return names, index_of_part[soup.part]
 
 
-def _overlap(uvs: Doubles, material: Ints) -> bool:
+def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     """Return whether faces of different materials share many texels."""
     if material.min() == material.max():
         return False
     size = BAKED_SIZE
-    face, row, column, _ = pixels_in(uvs * size - 0.5, (size, size), tolerance=-1e-6)
+    face, row, column, _ = rasterize_triangles(
+        uvs * size - 0.5, (size, size), tolerance=-1e-6
+    )
     first_material = np.full(size * size, len(uvs))
     last_material = np.full(size * size, -1)
     np.minimum.at(first_material, row * size + column, material[face])
     np.maximum.at(last_material, row * size + column, material[face])
     n_shared = (last_material > first_material).sum()
-    return bool(n_shared > _SHARED * (last_material >= 0).sum())
+    return bool(n_shared > _MAX_SHARED * (last_material >= 0).sum())
 
 
-def _of_one_color(soup: Soup, surface: ImportedSurface) -> Floats:
+def _make_plain_map(soup: Soup, surface: ImportedSurface) -> Float32Array:
     """Return a small map of the only color of a soup."""
-    color = _plain(surface)
+    color = _get_plain_color(surface)
     if soup.colors.min() != 1.0:
-        color = _tinted(color, soup.colors[0, 0])
+        color = _tint(color, soup.colors[0, 0])
     return np.full((PLAIN_SIZE, PLAIN_SIZE, len(color)), color, dtype=np.float32)
 
 
-def _lit_twice(
-    uvs: Doubles, surface: ImportedSurface, pictures: Sequence[Floats]
+def _is_lit_twice(
+    uvs: Float64Array, surface: ImportedSurface, pictures: Sequence[Float32Array]
 ) -> bool:
     """Return whether texels that emit light are on several faces.
 
@@ -166,33 +181,33 @@ def _lit_twice(
         return False
     is_lit = pictures[-1].any(axis=2)
     height, width = is_lit.shape
-    _, rows, columns, _ = pixels_in(
-        _in_texels(uvs, (height, width)), (height, width), tolerance=-1e-6
+    _, rows, columns, _ = rasterize_triangles(
+        _to_texels(uvs, (height, width)), (height, width), tolerance=-1e-6
     )
     n_faces = np.bincount(rows * width + columns, minlength=height * width)
     n_faces_if_lit = n_faces.reshape(height, width)[is_lit]
-    return bool((n_faces_if_lit > 1).sum() > _SHARED * max(1, len(n_faces_if_lit)))
+    return bool((n_faces_if_lit > 1).sum() > _MAX_SHARED * max(1, len(n_faces_if_lit)))
 
 
-def _in_texels(uvs: Doubles, shape: tuple[int, int]) -> Doubles:
+def _to_texels(uvs: Float64Array, shape: tuple[int, int]) -> Float64Array:
     """Return UVs (F, 3, 2) as columns and rows of a map of a shape (height, width)."""
     columns = uvs[:, :, 0] * shape[1] - 0.5
     rows = (1.0 - uvs[:, :, 1]) * shape[0] - 0.5
     return np.stack([columns, rows], axis=2)
 
 
-def _why(
-    soup: Soup, used: Sequence[ImportedSurface], uniform: bool, one_factor: bool
+def _describe_reason(
+    soup: Soup, used: Sequence[ImportedSurface], is_uniform: bool, has_one_factor: bool
 ) -> str:
     """Return the reason why an object was baked, as a sentence for its warnings."""
-    if not uniform:
+    if not is_uniform:
         n_materials = len({surface.name or id(surface) for surface in used})
         if n_materials > 1:
             baked_things = f"the colours of its {n_materials} materials"
         else:
             baked_things = "the pictures of its material"
         return f"{baked_things} were baked into one texture"
-    if not one_factor or soup.colors.min() < 1.0:
+    if not has_one_factor or soup.colors.min() < 1.0:
         return "its vertex or face colours were baked into a texture"
     if not np.isfinite(soup.uvs).all():
         substitute = "its normal map is left out"
@@ -209,16 +224,16 @@ def _why(
     )
 
 
-def _plain(surface: ImportedSurface) -> Floats:
+def _get_plain_color(surface: ImportedSurface) -> Float32Array:
     """Return the color of a surface, or neutral grey if it has none."""
     if surface.color is None:
-        return np.full(3, NEUTRAL, dtype=np.float32)
+        return np.full(3, NEUTRAL_GREY, dtype=np.float32)
     return surface.color
 
 
-def _tinted(
+def _tint(
     color: npt.NDArray[np.floating], factor: npt.NDArray[np.floating]
-) -> Floats:
+) -> Float32Array:
     """Multiply display-referred colors (..., 3 or 4) by linear factors (..., 3).
 
     Opacity stays.
@@ -233,19 +248,24 @@ def _tinted(
 # ---- The file's UVs ----
 
 
-def _usable(soup: Soup, uvs: Doubles) -> bool:
+def _is_usable(soup: Soup, uvs: Float64Array) -> bool:
     """Return whether UVs (F, 3, 2) are in [0, 1], and neither squashed nor tiny."""
-    if not np.isfinite(uvs).all() or uvs.min() < -_SLACK or uvs.max() > 1.0 + _SLACK:
+    if (
+        not np.isfinite(uvs).all()
+        or uvs.min() < -_UV_TOLERANCE
+        or uvs.max() > 1.0 + _UV_TOLERANCE
+    ):
         return False
-    uv_area = np.abs(doubled_areas(uvs)) / 2.0
+    uv_area = np.abs(compute_doubled_areas(uvs)) / 2.0
     surface_area = np.linalg.norm(soup.face_vectors(), axis=1)
     squashed_area = surface_area[uv_area < 1e-12].sum()
     return bool(
-        squashed_area <= _SQUASHED * surface_area.sum() and uv_area.sum() >= _CRAMPED
+        squashed_area <= _MAX_SQUASHED * surface_area.sum()
+        and uv_area.sum() >= _MIN_UV_AREA
     )
 
 
-def _into_unit_square(soup: Soup) -> Doubles:
+def _move_into_unit_square(soup: Soup) -> Float64Array:
     """Move each chart by an integer offset so that it starts in the unit square.
 
     A repeating texture looks the same. Returns UVs (F, 3, 2).
@@ -256,20 +276,20 @@ def _into_unit_square(soup: Soup) -> Doubles:
     vertex = vertex.reshape(-1, 3)
     starts = np.concatenate([vertex[:, 0], vertex[:, 1]])
     ends = np.concatenate([vertex[:, 1], vertex[:, 2]])
-    chart = connected(int(vertex.max()) + 1, starts, ends)
+    chart = find_components(int(vertex.max()) + 1, starts, ends)
     low = np.full((int(chart.max()) + 1, 2), np.inf)
     np.minimum.at(low, chart[vertex.reshape(-1)], flat_uvs)
-    uvs: Doubles = soup.uvs - np.floor(low + _SLACK)[chart[vertex]]
+    uvs: Float64Array = soup.uvs - np.floor(low + _UV_TOLERANCE)[chart[vertex]]
     return uvs
 
 
-def _windowed(
-    uvs: Doubles, pictures: Sequence[Floats], colors: Floats | None
-) -> tuple[Doubles, Sequence[Floats]]:
+def _crop_to_window(
+    uvs: Float64Array, pictures: Sequence[Float32Array], colors: Float32Array | None
+) -> tuple[Float64Array, Sequence[Float32Array]]:
     """Crop images to the window that UVs span; the layout of the charts stays.
 
     This is done if UVs overstep the unit square a little or use a corner of it. Windows
-    larger than `_WINDOW` textures are left alone: there the textures repeat.
+    larger than `_MAX_WINDOW` textures are left alone: there the textures repeat.
 
     Args:
         uvs: (F, 3, 2).
@@ -283,10 +303,13 @@ def _windowed(
     high = uvs.max(axis=(0, 1)) + texel
     size = high - low
     is_inside = (
-        low.min() >= -_SLACK - texel.max() and high.max() <= 1.0 + _SLACK + texel.max()
+        low.min() >= -_UV_TOLERANCE - texel.max()
+        and high.max() <= 1.0 + _UV_TOLERANCE + texel.max()
     )
-    is_filled = is_inside and np.abs(doubled_areas(uvs)).sum() / 2.0 >= _CRAMPED
-    if size.max() > _WINDOW or is_filled:
+    is_filled = (
+        is_inside and np.abs(compute_doubled_areas(uvs)).sum() / 2.0 >= _MIN_UV_AREA
+    )
+    if size.max() > _MAX_WINDOW or is_filled:
         return uvs, pictures
     cropped = []
     for picture in pictures:
@@ -296,7 +319,7 @@ def _windowed(
         columns = low[0] + (np.arange(width) + 0.5) / width * size[0]
         rows = high[1] - (np.arange(height) + 0.5) / height * size[1]
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        look_up = filtered if picture is colors else sampled
+        look_up = sample_colors if picture is colors else sample_texture
         cropped.append(look_up(picture, grid).reshape(height, width, -1))
     return (uvs - low) / size, cropped
 
@@ -304,7 +327,9 @@ def _windowed(
 # ---- Baking ----
 
 
-def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> SurfaceMaps:
+def bake(
+    uvs: Float64Array, soup: Soup, surfaces: Sequence[ImportedSurface]
+) -> SurfaceMaps:
     """Bake the colors, normals and emission of a soup into maps for new UVs.
 
     Texels outside every chart repeat the nearest one inside, so that filtering finds no
@@ -319,48 +344,50 @@ def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surf
         Maps (N, N, ...) with room for the texels that the object shows.
     """
     size = BAKED_SIZE
-    texels = _texels(soup, surfaces)
-    while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
+    texels = _count_texels(soup, surfaces)
+    while size < TEXTURE_LIMIT and size * size * _FILL_FRACTION < texels:
         size *= 2
-    pixels = pixels_in(_in_texels(uvs, (size, size)), (size, size), tolerance=1e-9)
+    pixels = rasterize_triangles(
+        _to_texels(uvs, (size, size)), (size, size), tolerance=1e-9
+    )
     face, rows, columns, weights = pixels
-    has_opacity = any(_plain_or_texture(surface).shape[-1] == 4 for surface in surfaces)
+    has_opacity = any(_get_base_color(surface).shape[-1] == 4 for surface in surfaces)
     color = np.ones((size, size, 3 + has_opacity), np.float32)
     normals = None
     if any(surface.normal_map is not None for surface in surfaces):
-        normals = np.full((size, size, 3), FLAT)
+        normals = np.full((size, size, 3), FLAT_TEXEL)
     emission = None
     if any(surface.emission is not None for surface in surfaces):
         emission = np.zeros((size, size, 3), np.float32)
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
-    for surface, texel in zip(surfaces, grouped(soup.part[face]), strict=False):
+    for surface, texel in zip(surfaces, group_indices(soup.part[face]), strict=False):
         if not len(texel):
             continue
         y = rows[texel]
         x = columns[texel]
         file_uvs = np.einsum("tk,tkc->tc", weights[texel], soup.uvs[face[texel]])
-        texel_color = _looked_up(surface, file_uvs, soup, surfaces)
-        color[y, x, : texel_color.shape[1]] = _tinted(texel_color, factor[texel])
+        texel_color = _sample_base_color(surface, file_uvs, soup, surfaces)
+        color[y, x, : texel_color.shape[1]] = _tint(texel_color, factor[texel])
         if not np.isfinite(file_uvs).all():
             continue
         if normals is not None and surface.normal_map is not None:
-            normals[y, x] = turned(
-                sampled(surface.normal_map, file_uvs),
+            normals[y, x] = convert_normals(
+                sample_texture(surface.normal_map, file_uvs),
                 soup,
                 uvs,
                 face[texel],
                 weights[texel],
             )
         if emission is not None and surface.emission is not None:
-            emission[y, x] = sampled(surface.emission, file_uvs)
+            emission[y, x] = sample_texture(surface.emission, file_uvs)
     is_inside = np.zeros((size, size), np.bool_)
     is_inside[rows, columns] = True
     return _fill_gaps(SurfaceMaps(color, normals, emission), is_inside)
 
 
-def _plain_or_texture(surface: ImportedSurface) -> Floats:
+def _get_base_color(surface: ImportedSurface) -> Float32Array:
     """Return the base color of a surface: its texture (H, W, C), or its color (C,)."""
-    return _plain(surface) if surface.texture is None else surface.texture
+    return _get_plain_color(surface) if surface.texture is None else surface.texture
 
 
 def _fill_gaps(maps: SurfaceMaps, is_inside: npt.NDArray[np.bool_]) -> SurfaceMaps:
@@ -375,45 +402,49 @@ def _fill_gaps(maps: SurfaceMaps, is_inside: npt.NDArray[np.bool_]) -> SurfaceMa
         normals = normals[nearest_texel]
     emission = maps.emission
     if emission is not None:
-        emission = emission[nearest_texel] * (distance < _BORDER)[:, :, None]
+        emission = emission[nearest_texel] * (distance < _EMISSION_BORDER)[:, :, None]
     return SurfaceMaps(maps.color[nearest_texel], normals, emission)
 
 
-def _looked_up(
+def _sample_base_color(
     surface: ImportedSurface,
-    uvs: Doubles,
+    uvs: Float64Array,
     soup: Soup,
     surfaces: Sequence[ImportedSurface],
-) -> Floats:
+) -> Float32Array:
     """Return the base color (T, 3 or 4) of a surface at UVs (T, 2).
 
     If UVs are missing, it is the mean over all faces that show its texture.
     """
     if surface.texture is not None and np.isfinite(uvs).all():
-        return filtered(surface.texture, uvs)
-    color = _plain(surface)
+        return sample_colors(surface.texture, uvs)
+    color = _get_plain_color(surface)
     if surface.texture is not None:
         shows_texture = [other.texture is surface.texture for other in surfaces]
         is_selected = np.array(shows_texture)[soup.part]
         areas = np.linalg.norm(soup.face_vectors(), axis=1)[is_selected]
-        mean = mean_over(_in_linear(surface.texture), soup.uvs[is_selected], areas)
-        color = _in_display(mean)
+        mean = average_over_faces(
+            _to_linear(surface.texture), soup.uvs[is_selected], areas
+        )
+        color = _to_display(mean)
     return np.broadcast_to(color[None], (len(uvs), len(color)))
 
 
-def _texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
+def _count_texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
     """Return how many texels of the file's images an object shows."""
     n_texels = 0.0
-    uv_areas = np.nan_to_num(np.abs(doubled_areas(soup.uvs)) / 2.0)
+    uv_areas = np.nan_to_num(np.abs(compute_doubled_areas(soup.uvs)) / 2.0)
     for part, area in enumerate(np.bincount(soup.part, uv_areas)):
         sizes = (
-            picture.shape[0] * picture.shape[1] for picture in surfaces[part].pictures
+            picture.shape[0] * picture.shape[1] for picture in surfaces[part].images
         )
         n_texels += float(area) * max(sizes, default=0)
     return n_texels
 
 
-def mean_over(texture: Floats, uvs: Doubles, areas: Doubles) -> Floats:
+def average_over_faces(
+    texture: Float32Array, uvs: Float64Array, areas: Float64Array
+) -> Float32Array:
     """Return the mean of a texture over faces, weighted by their areas.
 
     Each face is sampled at the centers of equal small triangles.
@@ -431,11 +462,11 @@ def mean_over(texture: Floats, uvs: Doubles, areas: Doubles) -> Floats:
         return np.asarray(texture.mean(axis=(0, 1), dtype=np.float64), np.float32)
     uvs = uvs[is_known]
     areas = areas[is_known]
-    steps = int(np.clip(np.sqrt(_LOOKS / len(areas)), 1, _FINEST))
-    weights = _sample_weights(steps)
+    steps = int(np.clip(np.sqrt(_MAX_SAMPLES / len(areas)), 1, _MAX_STEPS))
+    weights = _compute_sample_weights(steps)
     height, width = texture.shape[:2]
     total = np.zeros(texture.shape[2])
-    n_batches = -(-len(areas) * len(weights) // _LOOKS)
+    n_batches = -(-len(areas) * len(weights) // _MAX_SAMPLES)
     for batch in np.array_split(np.arange(len(areas)), n_batches):
         points = np.einsum("pk,fkc->fpc", weights, uvs[batch]).reshape(-1, 2)
         rows = (1.0 - points[:, 1]) % 1.0 * height
@@ -448,7 +479,7 @@ def mean_over(texture: Floats, uvs: Doubles, areas: Doubles) -> Floats:
     return np.asarray(total / areas.sum(), np.float32)
 
 
-def _sample_weights(steps: int) -> Doubles:
+def _compute_sample_weights(steps: int) -> Float64Array:
     """Return barycentric weights (P, 3) of the centers of small triangles.
 
     A triangle is divided into steps**2 equal ones, some of which point up and some
@@ -466,16 +497,16 @@ def _sample_weights(steps: int) -> Doubles:
     return np.stack([1.0 - b - c, b, c], axis=1)
 
 
-def filtered(colors: Floats, uvs: Doubles) -> Floats:
+def sample_colors(colors: Float32Array, uvs: Float64Array) -> Float32Array:
     """Sample a repeating texture of display-referred colors in linear light.
 
     Interpolation is bilinear; what is transparent does not count. Arguments and result
-    are those of `sampled`.
+    are those of `sample_texture`.
     """
-    return _in_display(sampled(_in_linear(colors), uvs))
+    return _to_display(sample_texture(_to_linear(colors), uvs))
 
 
-def _in_linear(colors: Floats) -> Floats:
+def _to_linear(colors: Float32Array) -> Float32Array:
     """Return display-referred colors (..., 3 or 4) as linear, premultiplied ones."""
     linear = srgb_to_linear(colors[..., :3])
     if colors.shape[-1] == 3:
@@ -484,7 +515,7 @@ def _in_linear(colors: Floats) -> Floats:
     return np.concatenate([linear * opacity, opacity], axis=-1)
 
 
-def _in_display(colors: Floats) -> Floats:
+def _to_display(colors: Float32Array) -> Float32Array:
     """Return linear, premultiplied colors (..., 3 or 4) as display-referred ones."""
     linear = colors[..., :3]
     opacity = colors[..., 3:]
@@ -493,7 +524,7 @@ def _in_display(colors: Floats) -> Floats:
     return np.concatenate([linear_to_srgb(linear), opacity], axis=-1)
 
 
-def sampled(texture: Floats, uvs: Doubles) -> Floats:
+def sample_texture(texture: Float32Array, uvs: Float64Array) -> Float32Array:
     """Sample a repeating texture with bilinear interpolation of its values.
 
     Args:
@@ -506,7 +537,7 @@ def sampled(texture: Floats, uvs: Doubles) -> Floats:
     height, width = texture.shape[:2]
     # Modulo comes first, since a huge number times a width is infinite.
     u, v = (uvs % 1.0).T
-    return looked_up(texture, u * width - 0.5, (1.0 - v) * height - 0.5)
+    return look_up_texture(texture, u * width - 0.5, (1.0 - v) * height - 0.5)
 
 
 # ---- Normal maps at other texture coordinates ----
@@ -515,11 +546,11 @@ def sampled(texture: Floats, uvs: Doubles) -> Floats:
 # points down it where texture coordinates are mirrored.
 
 # Fraction of the surface whose mirrored texture coordinates are ignored.
-FEW = 1e-3
+MIN_MIRRORED_FRACTION = 1e-3
 
 
-def _unmirrored(
-    soup: Soup, uvs: Doubles, maps: SurfaceMaps
+def _unmirror(
+    soup: Soup, uvs: Float64Array, maps: SurfaceMaps
 ) -> tuple[Soup, SurfaceMaps]:
     """Return a soup whose UVs mirror no face, and the maps for it.
 
@@ -533,12 +564,12 @@ def _unmirrored(
     """
     soup = replace(soup, uvs=uvs)
     normals = maps.normals
-    is_mirrored = doubled_areas(uvs) < 0.0
+    is_mirrored = compute_doubled_areas(uvs) < 0.0
     area = np.linalg.norm(soup.face_vectors(), axis=1)
     mirrored_fraction = float(area[is_mirrored].sum() / area.sum())
-    if normals is None or mirrored_fraction < FEW:
+    if normals is None or mirrored_fraction < MIN_MIRRORED_FRACTION:
         return soup, maps
-    if 1.0 - mirrored_fraction < FEW:
+    if 1.0 - mirrored_fraction < MIN_MIRRORED_FRACTION:
         flipped = normals * np.array([1, -1, 1], np.float32) + np.array(
             [0, 1, 0], np.float32
         )
@@ -557,22 +588,26 @@ def _unmirrored(
     return replace(soup, uvs=new_uvs), SurfaceMaps(color, normals, emission)
 
 
-def turned(
-    texels: Floats, before: Soup, after: Doubles, face: Ints, weights: Doubles
-) -> Floats:
+def convert_normals(
+    texels: Float32Array,
+    old_soup: Soup,
+    new_uvs: Float64Array,
+    face: IntArray,
+    weights: Float64Array,
+) -> Float32Array:
     """Convert texels of a normal map from the tangents of old UVs to those of new UVs.
 
     Args:
         texels: (T, 3) of the normal map.
-        before: the object with the old UVs.
-        after: (F, 3, 2) the new UVs.
+        old_soup: the object with the old UVs.
+        new_uvs: (F, 3, 2) the new UVs.
         face: (T,) the face that each texel is on.
         weights: (T, 3) barycentric weights of its corners.
     """
-    normal = unit_vectors(np.einsum("tk,tkc->tc", weights, before.normals[face]))
-    old_tangent = _tangents(before, normal, face)
-    new_tangent = _tangents(replace(before, uvs=after), normal, face)
-    handedness = np.sign(doubled_areas(before.uvs[face]))[:, None]
+    normal = normalize_vectors(np.einsum("tk,tkc->tc", weights, old_soup.normals[face]))
+    old_tangent = _compute_tangents(old_soup, normal, face)
+    new_tangent = _compute_tangents(replace(old_soup, uvs=new_uvs), normal, face)
+    handedness = np.sign(compute_doubled_areas(old_soup.uvs[face]))[:, None]
     old_bitangent = np.cross(normal, old_tangent) * handedness
     x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)
     in_plane = x[:, None] * old_tangent + y[:, None] * old_bitangent
@@ -580,10 +615,10 @@ def turned(
     new_y = (in_plane * np.cross(normal, new_tangent)).sum(axis=1)
     bumps = np.stack([new_x, new_y, z], axis=1)
     is_valid = np.isfinite(bumps).all(axis=1, keepdims=True)
-    return texels_of(np.where(is_valid, bumps, [0.0, 0.0, 1.0]))
+    return encode_normals(np.where(is_valid, bumps, [0.0, 0.0, 1.0]))
 
 
-def _tangents(soup: Soup, normal: Doubles, face: Ints) -> Doubles:
+def _compute_tangents(soup: Soup, normal: Float64Array, face: IntArray) -> Float64Array:
     """Return unit tangents (T, 3) along u on faces (T,), orthogonal to normals (T, 3).
 
     They are NaN where UVs have no area.
@@ -593,8 +628,8 @@ def _tangents(soup: Soup, normal: Doubles, face: Ints) -> Doubles:
     uvs = soup.uvs[used]
     (_, v1) = (uvs[:, 1] - uvs[:, 0]).T
     (_, v2) = (uvs[:, 2] - uvs[:, 0]).T
-    handedness = np.sign(doubled_areas(uvs))[:, None]
+    handedness = np.sign(compute_doubled_areas(uvs))[:, None]
     tangent = ((b - a) * v2[:, None] - (c - a) * v1[:, None]) * handedness
     tangent = tangent[index.reshape(-1)]
     along_normal = normal * (tangent * normal).sum(axis=1, keepdims=True)
-    return unit_vectors(tangent - along_normal)
+    return normalize_vectors(tangent - along_normal)

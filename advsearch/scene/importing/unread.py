@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Generic, TypeVar
 
-from advsearch.scene.importing.files import shown
+from advsearch.scene.importing.files import format_name
 
 MAX_NAMED = 12  # keys that one message names
 
@@ -33,12 +33,12 @@ class TrackedKeys(Generic[T]):
         values: Mapping[str, T],
         *,
         fold: Callable[[str], str] = str,
-        within: str = "",
+        prefix: str = "",
     ) -> None:
         # Keys, as spelled, that a later one of the same form hides.
         self.repeated: list[str] = []
         self._fold = fold
-        self._within = within
+        self._prefix = prefix
         self._values: dict[str, T] = {}
         self._spelling: dict[str, str] = {}
         self._read: set[str] = set()
@@ -68,7 +68,7 @@ class TrackedKeys(Generic[T]):
         """Count keys, in folded form, as read."""
         self._read.update(keys)
 
-    def nested(self, key: str) -> TrackedKeys[Any]:
+    def get_nested(self, key: str) -> TrackedKeys[Any]:
         """Return the keys within the value of a key; they are tracked separately.
 
         Without such a value there are no keys. A value that is no mapping stays unread.
@@ -81,11 +81,13 @@ class TrackedKeys(Generic[T]):
                 inner = {str(name): item for name, item in value.items()}
             spelled = self._spelling.get(key, key)
             self._nested[key] = TrackedKeys(
-                inner, fold=self._fold, within=f"{self._within}{spelled}."
+                inner, fold=self._fold, prefix=f"{self._prefix}{spelled}."
             )
         return self._nested[key]
 
-    def unread(self, is_quiet: Callable[[str, T], bool] | None = None) -> list[str]:
+    def find_unread(
+        self, is_quiet: Callable[[str, T], bool] | None = None
+    ) -> list[str]:
         """Return the keys that were not read, as spelled, after those they are within.
 
         Args:
@@ -96,12 +98,12 @@ class TrackedKeys(Generic[T]):
         for key, spelled in self._spelling.items():
             quiet = is_quiet is not None and is_quiet(key, self._values[key])
             if key not in self._read and not quiet:
-                names.append(self._within + spelled)
+                names.append(self._prefix + spelled)
             if key in self._nested:
-                names += self._nested[key].unread()
+                names += self._nested[key].find_unread()
         return names
 
-    def spelled(self, key: str) -> str:
+    def get_spelling(self, key: str) -> str:
         """Return a key, in folded form, as the file spells it; itself if it is absent."""
         return self._spelling.get(key, key)
 
@@ -119,6 +121,6 @@ class TrackedKeys(Generic[T]):
 def join_names(names: Iterable[str], max_named: int = MAX_NAMED) -> str:
     """Format names out of a file for a message: quoted, cut, and the rest counted."""
     unique_names = list(dict.fromkeys(names))
-    text = ", ".join(shown(name) for name in unique_names[:max_named])
+    text = ", ".join(format_name(name) for name in unique_names[:max_named])
     n_more = len(unique_names) - max_named
     return f"{text} and {n_more:,} more" if n_more > 0 else text

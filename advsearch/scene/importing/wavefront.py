@@ -16,30 +16,35 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Bools, Doubles, Ints, face_vectors
+from advsearch.scene.assets import (
+    BoolArray,
+    Float64Array,
+    IntArray,
+    compute_area_vectors,
+)
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import mtl_surfaces
 from advsearch.scene.importing.files import (
-    MOST_CORNERS,
+    MAX_CORNERS,
     Notes,
+    decode_text,
+    format_name,
     is_number,
-    numbers_in,
-    shown,
-    text_of,
+    parse_number_array,
 )
-from advsearch.scene.importing.geometry import cut_up
+from advsearch.scene.importing.geometry import triangulate_and_note
 from advsearch.scene.importing.mtl_surfaces import (
     MtlReader,
-    Painted,
-    libraries_of,
+    MtlSurface,
+    find_libraries,
     without_comment,
 )
 from advsearch.scene.importing.parts import (
-    NEUTRAL,
+    NEUTRAL_GREY,
     ImportedPart,
     ImportedSurface,
-    Looked,
-    alike,
+    IndexedValues,
+    group_faces,
     split_at_corners,
 )
 from advsearch.trust.named_files import References
@@ -50,16 +55,16 @@ FREE_FORM = (
     "bmat bsp bzp cdc cdp con cstype curv curv2 deg end hole mg parm res scrv "
     "sp step surf trim vp"
 ).split()
-WITHOUT_FACES = {
+NON_FACE_STATEMENTS = {
     "p": "points",
     "l": "lines",
     **dict.fromkeys(FREE_FORM, "curves and curved surfaces"),
 }
 # Limit of the material files, and of the materials, that a file may name; before
 # `scaled`.
-MOST_NAMED = 10_000
+MAX_MATERIALS = 10_000
 # How far texture coordinates may lie outside [0, 1] before the wrap mode matters.
-BEYOND = 0.01
+WRAP_TOLERANCE = 0.01
 # First words of a smoothing group (``s``) that turn smoothing off.
 NOT_SMOOTH = ("off", "0", "")
 
@@ -73,61 +78,69 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         FileFormatError: the file is of another kind, is cut short, refers to geometry
             that it does not contain, or has no faces.
     """
-    lines = Lines(data, notes)
-    tables = {kind: lines.table(kind) for kind in TABLES}
+    lines = ObjLines(data, notes)
+    tables = {kind: lines.read_table(kind) for kind in TABLES}
     if not len(tables["v"]):
         raise notes.damaged(EXPECTED, data)
     table_sizes = {kind: len(table) for kind, table in tables.items()}
-    corners, corner_counts, face_rows = lines.faces(table_sizes)
+    corners, corner_counts, face_rows = lines.read_faces(table_sizes)
     if (corner_counts < 3).all():
         raise FileFormatError(
             f"{path}: expected a mesh with faces, got points or "
             "lines only; export triangles"
         )
 
-    def find_mapped_faces(name: str, square_number: int) -> tuple[Doubles, Doubles]:
+    def find_mapped_faces(
+        name: str, square_number: int
+    ) -> tuple[Float64Array, Float64Array]:
         """Return UVs (F, 3, 2) and doubled areas (F,) of the faces with a material."""
         # Called only after the arrays below exist.
         is_selected = (
             (material == names.index(name))
             & (square == square_number)
-            & (uv.at >= 0).all(axis=1)
+            & (uv.rows >= 0).all(axis=1)
         )
-        selected_uvs = uv.values[uv.at[is_selected]]
-        vectors = face_vectors(position.values[position.at[is_selected]])
+        selected_uvs = uv.values[uv.rows[is_selected]]
+        vectors = compute_area_vectors(position.values[position.rows[is_selected]])
         return selected_uvs, np.linalg.norm(vectors, axis=1)
 
     reader = MtlReader(References(path), notes, find_mapped_faces)
-    library_lines, material_changes, smoothing_changes = _statements(lines, notes)
+    library_lines, material_changes, smoothing_changes = _parse_statements(lines, notes)
     _read_libraries(reader, library_lines, notes)
 
     points = tables["v"][:, :3]
-    triangles, polygon = cut_up(points[corners[:, 0]], corner_counts, notes)
-    position = Looked(points, corners[triangles, 0])
-    uv = Looked(tables["vt"], corners[triangles, 1])
-    normal = Looked(tables["vn"], corners[triangles, 2])
+    triangles, polygon = triangulate_and_note(
+        points[corners[:, 0]], corner_counts, notes
+    )
+    position = IndexedValues(points, corners[triangles, 0])
+    uv = IndexedValues(tables["vt"], corners[triangles, 1])
+    normal = IndexedValues(tables["vn"], corners[triangles, 2])
     rows = face_rows[polygon]
-    names, material = _in_effect(material_changes, rows)
-    notes.check_most(len(names), MOST_NAMED, "at most {} materials")
+    names, material = _find_values_in_effect(material_changes, rows)
+    notes.check_most(len(names), MAX_MATERIALS, "at most {} materials")
     is_flat = _find_flat_faces(smoothing_changes, rows, normal, notes)
-    colors = _colors(lines, tables["v"], notes)
+    colors = _read_colors(lines, tables["v"], notes)
     if colors is not None:
-        colors = colors[position.at]
-    has_uvs = np.asarray((uv.at >= 0).all(axis=1))
+        colors = colors[position.rows]
+    has_uvs = np.asarray((uv.rows >= 0).all(axis=1))
     square = _find_squares(reader, names, material, uv)
 
     parts = []
-    for group in alike(material, has_uvs, is_flat, square):
+    for group in group_faces(material, has_uvs, is_flat, square):
         first = group[0]
         name = names[material[first]] if material[first] >= 0 else ""
         painted = _find_material(
             reader, name, int(square[first]), colors is not None, bool(library_lines)
         )
         surface, tint = _combine_colors(painted.surface, colors, group, notes)
-        corner = mtl_surfaces.corner_of(int(square[first]))
+        corner = mtl_surfaces.get_square_corner(int(square[first]))
         uvs = (tables["vt"] - corner) * painted.scale + painted.offset
-        if painted.clamped and has_uvs[first] and _repeats(uvs[uv.at[group]]):
-            notes.say(
+        if (
+            painted.is_clamped
+            and has_uvs[first]
+            and _reaches_beyond(uvs[uv.rows[group]])
+        ):
+            notes.warn(
                 " has textures that are not to repeat beyond their edges "
                 "(-clamp); here they do"
             )
@@ -136,7 +149,7 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
                 group,
                 position,
                 normal,
-                Looked(uvs, uv.at),
+                IndexedValues(uvs, uv.rows),
                 tint,
                 surface,
                 flat=bool(is_flat[first]),
@@ -152,26 +165,29 @@ def _read_libraries(
     unique_lines = list(dict.fromkeys(library_lines))
     notes.check_most(
         len(unique_lines),
-        MOST_NAMED,
+        MAX_MATERIALS,
         "at most {} lines that name material files (mtllib)",
     )
-    libraries = libraries_of(unique_lines, reader.references)
-    notes.check_most(len(libraries), MOST_NAMED, "at most {} material files")
+    libraries = find_libraries(unique_lines, reader.references)
+    notes.check_most(len(libraries), MAX_MATERIALS, "at most {} material files")
     for name in libraries:
         reader.read_library(name)
 
 
 def _find_flat_faces(
-    smoothing_changes: list[tuple[int, str]], rows: Ints, normal: Looked, notes: Notes
-) -> Bools:
+    smoothing_changes: list[tuple[int, str]],
+    rows: IntArray,
+    normal: IndexedValues,
+    notes: Notes,
+) -> BoolArray:
     """Return for each triangle whether its smoothing group is off, (T,)."""
-    values, group = _in_effect(smoothing_changes, rows)
+    values, group = _find_values_in_effect(smoothing_changes, rows)
     is_off_by_group = [value in NOT_SMOOTH for value in values]
     # Index -1, of triangles before the first statement, is the last entry.
     is_off = np.array([*is_off_by_group, False])[group]
-    lacks_normals = (normal.at < 0).any(axis=1)
+    lacks_normals = (normal.rows < 0).any(axis=1)
     if ((group >= 0) & ~is_off & lacks_normals).any():
-        notes.say(
+        notes.warn(
             "smoothing groups are left out: its normals are made, with creases "
             "at sharp edges"
         )
@@ -179,16 +195,16 @@ def _find_flat_faces(
 
 
 def _find_squares(
-    reader: MtlReader, names: Sequence[str], material: Ints, uv: Looked
-) -> Ints:
+    reader: MtlReader, names: Sequence[str], material: IntArray, uv: IndexedValues
+) -> IntArray:
     """Return the UDIM square of each triangle, (T,); 0 where one image is for all."""
     square = np.zeros(len(material), np.int64)
-    has_uvs = (uv.at >= 0).all(axis=1)
+    has_uvs = (uv.rows >= 0).all(axis=1)
     for material_index in np.unique(material[has_uvs & (material >= 0)]):
         faces = np.flatnonzero(has_uvs & (material == material_index))
-        face_squares = mtl_surfaces.squares(uv.values[uv.at[faces]])
+        face_squares = mtl_surfaces.compute_squares(uv.values[uv.rows[faces]])
         candidates = np.unique(face_squares).tolist()
-        with_image = reader.squares_of(names[material_index], candidates)
+        with_image = reader.find_squares(names[material_index], candidates)
         square[faces] = np.where(np.isin(face_squares, with_image), face_squares, 0)
     return square
 
@@ -199,30 +215,32 @@ def _find_material(
     square_number: int,
     has_colors: bool,
     names_libraries: bool,
-) -> Painted:
+) -> MtlSurface:
     """Return the material of a name, or a plain one and a note if there is none."""
     if not name:
-        return Painted(ImportedSurface())
-    painted = reader.painted(name, square_number)
+        return MtlSurface(ImportedSurface())
+    painted = reader.get_surface(name, square_number)
     if painted is not None:
         return painted
     substitute = "the colour of its vertices" if has_colors else "neutral grey"
     instead = f"{substitute} is used instead"
-    if reader.libraries:
+    if reader.n_libraries:
         lacks = (
-            "its .mtl file lacks" if reader.libraries == 1 else "its .mtl files lack"
+            "its .mtl file lacks" if reader.n_libraries == 1 else "its .mtl files lack"
         )
-        reader.notes.say(f" uses the material {shown(name)}, which {lacks}; {instead}")
+        reader.notes.warn(
+            f" uses the material {format_name(name)}, which {lacks}; {instead}"
+        )
     elif not names_libraries:  # otherwise a note says that none could be read
-        reader.notes.say(
+        reader.notes.warn(
             f" uses materials and names no material file (mtllib); {instead}"
         )
-    return Painted(ImportedSurface(name=without_comment(name)))
+    return MtlSurface(ImportedSurface(name=without_comment(name)))
 
 
 def _combine_colors(
-    surface: ImportedSurface, colors: Doubles | None, group: Ints, notes: Notes
-) -> tuple[ImportedSurface, Doubles | None]:
+    surface: ImportedSurface, colors: Float64Array | None, group: IntArray, notes: Notes
+) -> tuple[ImportedSurface, Float64Array | None]:
     """Decide how vertex colors and a material's own color are combined.
 
     Args:
@@ -239,22 +257,22 @@ def _combine_colors(
     is_tinted = colors[group].min() < 1.0
     if surface.texture is not None:
         if is_tinted:
-            notes.say("colours of vertices are left out where there is a texture")
+            notes.warn("colours of vertices are left out where there is a texture")
         return surface, None
     if surface.color is None:
         return replace(surface, color=np.ones(3, np.float32)), colors
     if is_tinted and surface.color[:3].min() < 0.999:
-        notes.say("colours of vertices are multiplied by the Kd of their material")
+        notes.warn("colours of vertices are multiplied by the Kd of their material")
     return surface, colors
 
 
-def _repeats(uvs: Doubles) -> bool:
+def _reaches_beyond(uvs: Float64Array) -> bool:
     """Return whether UVs reach beyond [0, 1], where a texture repeats; NaN counts."""
-    return not (uvs.min() >= -BEYOND and uvs.max() <= 1.0 + BEYOND)
+    return not (uvs.min() >= -WRAP_TOLERANCE and uvs.max() <= 1.0 + WRAP_TOLERANCE)
 
 
-def _statements(
-    lines: Lines, notes: Notes
+def _parse_statements(
+    lines: ObjLines, notes: Notes
 ) -> tuple[list[str], list[tuple[int, str]], list[tuple[int, str]]]:
     """Parse the statements that are no numbers, and note those that are left out.
 
@@ -265,7 +283,7 @@ def _statements(
     library_lines = list[str]()
     material_changes = list[tuple[int, str]]()
     smoothing_changes = list[tuple[int, str]]()
-    for row, keyword, rest in lines.others():
+    for row, keyword, rest in lines.iterate_others():
         key = keyword.lower()
         argument = without_comment(rest).lower()
         if key == "mtllib":
@@ -274,14 +292,16 @@ def _statements(
             material_changes.append((row, " ".join(rest.split())))
         elif key == "s":
             smoothing_changes.append((row, argument))
-        elif key in WITHOUT_FACES:
-            notes.has(f"{WITHOUT_FACES[key]}, statement", key)
+        elif key in NON_FACE_STATEMENTS:
+            notes.record(f"{NON_FACE_STATEMENTS[key]}, statement", key)
         elif key not in GROUPING and argument not in ("off", "0"):
-            notes.has("statement", keyword)
+            notes.record("statement", keyword)
     return library_lines, material_changes, smoothing_changes
 
 
-def _in_effect(changes: list[tuple[int, str]], rows: Ints) -> tuple[list[str], Ints]:
+def _find_values_in_effect(
+    changes: list[tuple[int, str]], rows: IntArray
+) -> tuple[list[str], IntArray]:
     """Find the value in effect on each row, given the rows at which it changes.
 
     Returns:
@@ -297,7 +317,9 @@ def _in_effect(changes: list[tuple[int, str]], rows: Ints) -> tuple[list[str], I
     return values, change_index[last_change]
 
 
-def _colors(lines: Lines, table: Doubles, notes: Notes) -> Doubles | None:
+def _read_colors(
+    lines: ObjLines, table: Float64Array, notes: Notes
+) -> Float64Array | None:
     """Return the linear color (V, 3) of every vertex, or None if the file has none.
 
     A ``v`` line has three coordinates, then perhaps a weight, or a color, or a color
@@ -307,18 +329,18 @@ def _colors(lines: Lines, table: Doubles, notes: Notes) -> Doubles | None:
     weight = table[:, 3]
     opacity = table[:, 6]
     if (np.isfinite(weight) & np.isnan(table[:, 4]) & (weight != 1.0)).any():
-        notes.has("weights of vertices, the fourth number of", "v")
+        notes.record("weights of vertices, the fourth number of", "v")
     if np.isfinite(opacity).any() and not np.isin(opacity, (1.0, 255.0)).all():
-        notes.has("opacities of vertices, the seventh number of", "v")
-    stored: Doubles | None = table[:, 3:6]
+        notes.record("opacities of vertices, the seventh number of", "v")
+    stored: Float64Array | None = table[:, 3:6]
     if np.isnan(table[:, 5]).all():
-        stored = lines.zbrush_colors(len(table))
+        stored = lines.read_zbrush_colors(len(table))
     if stored is None:
         return None
     has_color = np.asarray(np.isfinite(stored).all(axis=1))
     is_of_bytes = has_color.any() and stored[has_color].max() > 2.0
     scale = 255.0 if is_of_bytes else 1.0
-    colors = np.where(has_color[:, None], stored / scale, NEUTRAL)
+    colors = np.where(has_color[:, None], stored / scale, NEUTRAL_GREY)
     return np.asarray(
         srgb_to_linear(np.clip(colors, 0.0, 1.0).astype(np.float32)), dtype=np.float64
     )
@@ -340,7 +362,7 @@ _BLANK, _IN_CORNERS = (
 )
 
 
-class Lines:
+class ObjLines:
     """The lines of an OBJ file, sorted into ``v``, ``vt``, ``vn``, ``f`` and others.
 
     Raises:
@@ -354,7 +376,7 @@ class Lines:
         self.notes = notes
         self.text = text
         # Files that were cut short do not end in a line break.
-        self.unended = not data.endswith((b"\n", b"\r"))
+        self.is_unended = not data.endswith((b"\n", b"\r"))
         self.bytes = np.frombuffer(text, dtype=np.uint8)
         self.ends = np.flatnonzero(self.bytes == _NEWLINE)
         self.starts = np.concatenate([[0], self.ends[:-1] + 1])
@@ -371,18 +393,18 @@ class Lines:
                 after_keyword = second
             self.kind[matches & _BLANK[after_keyword]] = index
 
-    def others(self) -> Iterator[tuple[int, str, str]]:
+    def iterate_others(self) -> Iterator[tuple[int, str, str]]:
         """Yield the row, keyword and rest of every line that is no table or comment."""
         first_byte = self.bytes[self.starts]
         is_other = (
             (self.kind == len(KINDS)) & (first_byte != _NEWLINE) & (first_byte != _HASH)
         )
         for row in np.flatnonzero(is_other):
-            line = text_of(self.text[self.starts[row] : self.ends[row]])
+            line = decode_text(self.text[self.starts[row] : self.ends[row]])
             keyword, _, rest = line.strip().replace("\t", " ").partition(" ")
             yield int(row), keyword, rest.strip()
 
-    def table(self, kind: str) -> Doubles:
+    def read_table(self, kind: str) -> Float64Array:
         """Return the numbers of all lines of a kind, (N, columns) as in `TABLES`.
 
         Numbers that a line does not have are 0 for ``vt`` and NaN for the others.
@@ -396,7 +418,7 @@ class Lines:
         if not len(rows):
             return np.zeros((0, columns))
         counts = _count_words(data)
-        values: Doubles = numbers_in(data.tobytes(), np.float64).astype(
+        values: Float64Array = parse_number_array(data.tobytes(), np.float64).astype(
             np.float64, copy=False
         )
         if counts.min() < min_count or len(values) != counts.sum():
@@ -413,12 +435,12 @@ class Lines:
         table[row[is_read], column[is_read]] = values[is_read]
         return table
 
-    def _raise_for_numbers(self, kind: str, rows: Ints) -> NoReturn:
+    def _raise_for_numbers(self, kind: str, rows: IntArray) -> NoReturn:
         """Raise FileFormatError for the first line whose numbers are wrong."""
         min_count = TABLES[kind][0]
         for line_number, words in self._iterate_words(rows):
             where = f"after {kind!r} on line {line_number}"
-            got = shown(" ".join(words))
+            got = format_name(" ".join(words))
             if len(words) < min_count:
                 expected = "3 numbers" if min_count == 3 else "numbers"
                 raise self.notes.damaged(
@@ -428,7 +450,7 @@ class Lines:
                 raise self.notes.damaged(f"numbers {where}", got)
         raise self.notes.damaged(f"numbers after {kind!r}", "something else")
 
-    def faces(self, counts: dict[str, int]) -> tuple[Ints, Ints, Ints]:
+    def read_faces(self, counts: dict[str, int]) -> tuple[IntArray, IntArray, IntArray]:
         """Return the corners of all faces.
 
         Args:
@@ -469,21 +491,21 @@ class Lines:
                 )
         return corners - 1, sizes, rows
 
-    def _check_sizes(self, rows: Ints, sizes: Ints) -> None:
+    def _check_sizes(self, rows: IntArray, sizes: IntArray) -> None:
         """Raise FileFormatError for a last face cut short, or faces over a limit."""
         is_last_line = rows[-1] == len(self.starts) - 1
-        if sizes[-1] < 3 and self.unended and is_last_line:
+        if sizes[-1] < 3 and self.is_unended and is_last_line:
             ((line_number, words),) = self._iterate_words(rows[-1:])
-            got = f"{shown(' '.join(['f', *words]))} (is the file cut short?)"
+            got = f"{format_name(' '.join(['f', *words]))} (is the file cut short?)"
             raise self.notes.damaged(f"3 or more corners on line {line_number}", got)
         where = f"in the face on line {rows[sizes.argmax()] + 1}"
         self.notes.check_most(
-            int(sizes.max()), MOST_CORNERS, f"at most {{}} corners {where}"
+            int(sizes.max()), MAX_CORNERS, f"at most {{}} corners {where}"
         )
         self.notes.check_faces(int((sizes - 2).clip(0).sum()))
 
     def _resolve_relative(
-        self, index: Ints, kind: str, rows: Ints, sizes: Ints
+        self, index: IntArray, kind: str, rows: IntArray, sizes: IntArray
     ) -> None:
         """Replace negative indices (C,), which count back from a face's line."""
         is_relative = index < 0
@@ -495,7 +517,7 @@ class Lines:
             self._raise_for_faces(rows)
         index[is_relative] += (count_before + 1)[is_relative]
 
-    def zbrush_colors(self, count: int) -> Doubles | None:
+    def read_zbrush_colors(self, count: int) -> Float64Array | None:
         """Return the colors (N, 3) in [0, 255] of ZBrush's comments, or None.
 
         ZBrush writes them after ``#MRGB``, eight hexadecimal digits for each vertex.
@@ -510,7 +532,7 @@ class Lines:
         channels = np.frombuffer(bytes.fromhex(digits.decode()), np.uint8)
         return channels.reshape(-1, 4)[:, 1:].astype(np.float64)
 
-    def _select_lines(self, kind: str) -> tuple[Ints, Bytes]:
+    def _select_lines(self, kind: str) -> tuple[IntArray, Bytes]:
         """Return the rows of the lines of a kind, and their bytes.
 
         Keywords and comments are blanked out or removed, so that only the arguments
@@ -528,13 +550,13 @@ class Lines:
             data = np.frombuffer(without_comments, dtype=np.uint8)
         return rows, data
 
-    def _iterate_words(self, rows: Ints) -> Iterator[tuple[int, list[str]]]:
+    def _iterate_words(self, rows: IntArray) -> Iterator[tuple[int, list[str]]]:
         """Yield the line number, from 1, and the arguments of each of some lines."""
         for row in rows:
-            line = text_of(self.text[self.starts[row] : self.ends[row]])
+            line = decode_text(self.text[self.starts[row] : self.ends[row]])
             yield int(row) + 1, line.partition("#")[0].split()[1:]
 
-    def _raise_for_faces(self, rows: Ints) -> NoReturn:
+    def _raise_for_faces(self, rows: IntArray) -> NoReturn:
         """Raise FileFormatError for the first face that has a wrong index."""
         counts_before_line = np.stack(
             [np.cumsum(self.kind == KINDS.index(kind)) for kind in TABLES], axis=1
@@ -544,7 +566,8 @@ class Lines:
             for word in words:
                 if not _CORNER.fullmatch(word):
                     raise self.notes.damaged(
-                        f"whole numbers in the face on line {line_number}", shown(word)
+                        f"whole numbers in the face on line {line_number}",
+                        format_name(word),
                     )
                 indices = [int(text or "1") for text in word.split("/")]
                 is_wrong = any(
@@ -554,7 +577,7 @@ class Lines:
                 if is_wrong:
                     raise self.notes.damaged(
                         f"indices that count from 1 in the face on line {line_number}",
-                        shown(word),
+                        format_name(word),
                     )
         raise self.notes.damaged("whole numbers in faces", "something else")
 
@@ -576,7 +599,7 @@ def _normalize_lines(data: bytes) -> bytes:
     return text
 
 
-def _count_words(data: Bytes) -> Ints:
+def _count_words(data: Bytes) -> IntArray:
     """Return how many words each line of bytes has."""
     is_blank = _BLANK[data]
     begins_word = ~is_blank
@@ -586,7 +609,7 @@ def _count_words(data: Bytes) -> Ints:
     return np.asarray(np.add.reduceat(begins_word, line_starts, dtype=np.int64))
 
 
-def _parse_corners(data: Bytes) -> tuple[Ints, Ints] | None:
+def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     """Parse the corners of face lines, such as ``1/2/3 4//5 6``.
 
     Returns:
@@ -612,7 +635,7 @@ def _parse_corners(data: Bytes) -> tuple[Ints, Ints] | None:
         or (column > 2).any()
     )
     without_slashes = np.where(is_slash, np.uint8(ord(" ")), data)
-    values = numbers_in(without_slashes.tobytes(), np.int64)
+    values = parse_number_array(without_slashes.tobytes(), np.int64)
     if is_malformed or len(values) != len(begins) or (values == 0).any():
         return None
     first_begins = begins[is_first]

@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import EnvironmentSetupError
-from advsearch.scene.assets import Ints
-from advsearch.scene.mitsuba_backend.variant import one_at_a_time
+from advsearch.scene.assets import IntArray
+from advsearch.scene.mitsuba_backend.variant import mitsuba_lock
 
 # All four as in Open Image Denoise's `autoexposure`.
-KEY = 0.18  # mean logarithmic luminance of the network's input
-BIN = 16  # width in pixels of the squares that are averaged
-DARKEST = 1e-8  # luminance below which a square does not count
+KEY_LUMINANCE = 0.18  # mean logarithmic luminance of the network's input
+BIN_SIZE = 16  # width in pixels of the squares that are averaged
+MIN_LUMINANCE = 1e-8  # luminance below which a square does not count
 # luminance of red, green and blue (ITU-R BT.709)
-LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
+LUMINANCE_WEIGHTS = np.array([0.212671, 0.715160, 0.072169])
 
 
 def denoise(
@@ -41,7 +41,7 @@ def denoise(
     Raises:
         EnvironmentSetupError: the package is not installed.
     """
-    with one_at_a_time:
+    with mitsuba_lock:
         try:
             # not before `mitsuba()`, which chooses libLLVM
             import mitsuba_oidn
@@ -51,9 +51,9 @@ def denoise(
                 "or use `denoise=none`"
             ) from error
         resolution = (radiance.shape[0], radiance.shape[1])
-        buffers = _buffers(resolution, threading.get_ident())
+        buffers = _get_buffers(resolution, threading.get_ident())
         color_buffer, albedo_buffer, normal_buffer, output = buffers
-        gain = _gain(radiance.detach())
+        gain = _compute_gain(radiance.detach())
         color_buffer.copy_(radiance.detach() * gain)
         albedo_buffer.copy_(albedo.detach())
         normal_buffer.copy_(normal.detach())
@@ -71,7 +71,7 @@ def denoise(
 
 
 @lru_cache(maxsize=8)
-def _buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
+def _get_buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
     """Return the buffers in which images of a size are denoised, in a thread.
 
     With other memory the filter would be set up anew, which takes longer than to run
@@ -80,28 +80,28 @@ def _buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
     return [torch.zeros(*resolution, 3) for _ in range(4)]
 
 
-def _gain(radiance: Tensor) -> float:
-    """Return the factor that gives an image the mean logarithmic luminance `KEY`.
+def _compute_gain(radiance: Tensor) -> float:
+    """Return the factor that gives an image the mean logarithmic luminance `KEY_LUMINANCE`.
 
     The denoiser would find it by itself, but adds up in an order that depends on the
     number of threads: by a few units in the last place. The image is (H, W, 3).
     """
-    luminance = (radiance.cpu().numpy() * LUMINANCE).sum(axis=-1)
+    luminance = (radiance.cpu().numpy() * LUMINANCE_WEIGHTS).sum(axis=-1)
     height, width = luminance.shape
-    row_starts = _bin_starts(height)
-    column_starts = _bin_starts(width)
+    row_starts = _find_bin_starts(height)
+    column_starts = _find_bin_starts(width)
     row_counts = np.diff(row_starts, append=height)
     column_counts = np.diff(column_starts, append=width)
     row_sums = np.add.reduceat(luminance, row_starts, axis=0)
     sums = np.add.reduceat(row_sums, column_starts, axis=1)
     means = sums / np.outer(row_counts, column_counts)
-    means = means[means > DARKEST]
+    means = means[means > MIN_LUMINANCE]
     if not means.size:
         return 1.0
-    return float(KEY / np.exp2(np.log2(means).mean()))
+    return float(KEY_LUMINANCE / np.exp2(np.log2(means).mean()))
 
 
-def _bin_starts(size: int) -> Ints:
-    """Return where the squares of `BIN` pixels begin along a side of an image."""
-    n_bins = -(-size // BIN)
+def _find_bin_starts(size: int) -> IntArray:
+    """Return where the squares of `BIN_SIZE` pixels begin along a side of an image."""
+    n_bins = -(-size // BIN_SIZE)
     return np.arange(n_bins) * size // n_bins

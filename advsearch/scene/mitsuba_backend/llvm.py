@@ -31,8 +31,8 @@ from pathlib import Path
 from advsearch.errors import AdvsearchError, EnvironmentSetupError
 from advsearch.trust.code import OWN_FOLDER
 
-VARIABLE = "DRJIT_LIBLLVM_PATH"
-MINIMUM = 17  # the first major version that renders: see the head of this file
+ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
+MIN_VERSION = 17  # the first major version that renders: see the head of this file
 _PATTERNS = (
     "usr/lib/*/libLLVM*.so*",
     "usr/lib/libLLVM*.so*",
@@ -68,15 +68,15 @@ class LibraryFile:
 
     path: Path
     version: Version  # major first, or ()
-    refused: str = ""  # why Dr.Jit cannot use it; empty if it can
+    refusal: str = ""  # why Dr.Jit cannot use it; empty if it can
 
     def __str__(self) -> str:
         version = ".".join(map(str, self.version)) or "version unknown"
-        reason = f": {self.refused}" if self.refused else ""
+        reason = f": {self.refusal}" if self.refusal else ""
         return f"{self.path} ({version}{reason})"
 
 
-def find(
+def find_libraries(
     root: Path = Path("/"), environ: Mapping[str, str] = os.environ
 ) -> list[LibraryFile]:
     """Find every libLLVM of this machine.
@@ -99,10 +99,12 @@ def find(
     if library and os.sep in library:
         paths.append(Path(library))
     link_of_file = {path.resolve(): path for path in paths if path.is_file()}
-    candidates = [examine(path, name_hint=link) for path, link in link_of_file.items()]
+    candidates = [
+        examine_library(path, name_hint=link) for path, link in link_of_file.items()
+    ]
     return sorted(
         candidates,
-        key=lambda candidate: (not candidate.refused, candidate.version),
+        key=lambda candidate: (not candidate.refusal, candidate.version),
         reverse=True,
     )
 
@@ -117,7 +119,7 @@ def _conda_patterns(prefix: str) -> list[str]:
     return [f"{directory}/{name}" for directory in directories for name in names]
 
 
-def examine(path: Path, *, name_hint: Path) -> LibraryFile:
+def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
     """Find out the version of a libLLVM file, and whether Dr.Jit can use it.
 
     The version is in its name, or in that of the link through which it was found;
@@ -127,7 +129,7 @@ def examine(path: Path, *, name_hint: Path) -> LibraryFile:
         path: of the file, symbolic links resolved.
         name_hint: the link through which it was found.
     """
-    interpreter_header = own_elf_header()
+    interpreter_header = read_interpreter_header()
     header = b""
     try:
         with path.open("rb") as file:
@@ -142,22 +144,24 @@ def examine(path: Path, *, name_hint: Path) -> LibraryFile:
         interpreter_header[18:20],
     ):
         return LibraryFile(path, (), "it is for another processor")
-    version = version_in(path) or version_in(name_hint) or asked_version(str(path))
-    return LibraryFile(path, version, refusal(version))
+    version = (
+        parse_version(path) or parse_version(name_hint) or query_version(str(path))
+    )
+    return LibraryFile(path, version, explain_refusal(version))
 
 
-def refusal(version: Version) -> str:
+def explain_refusal(version: Version) -> str:
     """Return why Dr.Jit cannot use this version of LLVM; empty if it can."""
     if not version:
         return "it does not tell its version, so it is older than 16 or not LLVM"
     if version[0] < 15:
         return "Dr.Jit refuses versions below 15"
-    if version[0] < MINIMUM:
+    if version[0] < MIN_VERSION:
         return "it aborts the process at the first render"
     return ""
 
 
-def version_in(path: Path) -> Version:
+def parse_version(path: Path) -> Version:
     """Return the version that a path has, or ().
 
     Such paths are ``libLLVM-19.so.1``, ``libLLVM.so.19.1`` and
@@ -183,33 +187,33 @@ def ensure_llvm() -> LibraryFile:
             names is not usable; the message lists what was found and the command that
             installs a good one.
     """
-    variable = os.environ.get(VARIABLE, "")
+    variable = os.environ.get(ENVIRONMENT_VARIABLE, "")
     if not variable:
-        library = newest(find())
-        os.environ[VARIABLE] = str(library.path)
+        library = select_newest(find_libraries())
+        os.environ[ENVIRONMENT_VARIABLE] = str(library.path)
         return library
     path = Path(variable)
     advice = "Correct it, or unset it to let advsearch look for one."
     # the dynamic loader looks it up; only the library itself knows its version
     if os.sep not in variable:
-        version = asked_version(variable)
-        library = LibraryFile(path, version, refusal(version))
+        version = query_version(variable)
+        library = LibraryFile(path, version, explain_refusal(version))
     elif path.is_file():
-        library = examine(path.resolve(), name_hint=path)
+        library = examine_library(path.resolve(), name_hint=path)
     else:
         raise EnvironmentSetupError(
-            f"{VARIABLE}: expected a libLLVM file, got {variable!r}, which does not "
+            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM file, got {variable!r}, which does not "
             f"exist. {advice}"
         )
-    if library.refused:
+    if library.refusal:
         raise EnvironmentSetupError(
-            f"{VARIABLE}: expected a libLLVM of version {MINIMUM} or later, got "
+            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM of version {MIN_VERSION} or later, got "
             f"{library}. {advice}"
         )
     return replace(library, path=path)
 
 
-def install_command(
+def get_install_command(
     release: Mapping[str, str] | None = None, system: str = sys.platform
 ) -> str:
     """Return the command that installs a good libLLVM here.
@@ -246,15 +250,15 @@ def install_command(
     return "\n".join(f"  {name}: {command}" for name, command in commands.items())
 
 
-def newest(candidates: list[LibraryFile]) -> LibraryFile:
+def select_newest(candidates: list[LibraryFile]) -> LibraryFile:
     """Return the first usable candidate that can be loaded.
 
     Raises:
         EnvironmentSetupError: there is none.
     """
-    rejected = [str(candidate) for candidate in candidates if candidate.refused]
+    rejected = [str(candidate) for candidate in candidates if candidate.refusal]
     for candidate in candidates:
-        if candidate.refused:
+        if candidate.refusal:
             continue
         try:
             # Dr.Jit loads the same file next, so this costs nothing
@@ -264,17 +268,17 @@ def newest(candidates: list[LibraryFile]) -> LibraryFile:
         else:
             return candidate
     found = "Found: " + "; ".join(rejected) + "." if rejected else "Found none."
-    command = install_command()
+    command = get_install_command()
     separator = "\n" if "\n" in command else " "
     raise EnvironmentSetupError(
-        f"expected a libLLVM of version {MINIMUM} or later, with which Dr.Jit compiles "
+        f"expected a libLLVM of version {MIN_VERSION} or later, with which Dr.Jit compiles "
         f"its kernels. {found} "
-        f"Install one with:{separator}{command}{separator}or name a file in {VARIABLE}."
+        f"Install one with:{separator}{command}{separator}or name a file in {ENVIRONMENT_VARIABLE}."
     )
 
 
 @functools.cache
-def own_elf_header() -> bytes:
+def read_interpreter_header() -> bytes:
     """Return the first bytes of this interpreter's file; empty if it is not ELF.
 
     They have word size, byte order and processor.
@@ -287,7 +291,7 @@ def own_elf_header() -> bytes:
     return header if header[:4] == b"\x7fELF" else b""
 
 
-def asked_version(library: str) -> Version:
+def query_version(library: str) -> Version:
     """Return the version that a library reports, or () if it reports none.
 
     It is loaded in another process, which a bad one may take down.

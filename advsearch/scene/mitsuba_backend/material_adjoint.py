@@ -44,10 +44,10 @@ from torch import Tensor
 
 from advsearch.scene.mitsuba_backend.material_view import (
     FilmView,
-    outline_terms,
-    sampler_of,
-    shadow_terms,
-    stream_of,
+    compute_outline_term,
+    compute_shadow_term,
+    make_sampler,
+    make_stream,
 )
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
@@ -141,14 +141,14 @@ def material_adjoint(
         # averages out better if it is not.
         tile = ROUGH_TILE if _is_rough(cotangent) else 1
         total += _interior_term(view, seed, spp, tile)
-    for index, mesh in enumerate([*view.meshes, *view.still]):
-        total += outline_terms(view, mesh, seed, index, boundary_spp)
-        total += shadow_terms(view, mesh, seed, index, shadow_spp)
+    for index, mesh in enumerate([*view.moving_meshes, *view.still_meshes]):
+        total += compute_outline_term(view, mesh, seed, index, boundary_spp)
+        total += compute_shadow_term(view, mesh, seed, index, shadow_spp)
     if dr.grad_enabled(total):
         dr.backward(total)
     gradients = dict[str, Tensor]()
-    for mesh in view.meshes:
-        gradients |= mesh.gradients()
+    for mesh in view.moving_meshes:
+        gradients |= mesh.get_gradients()
     return gradients
 
 
@@ -166,20 +166,24 @@ def _interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
         film, hit, sampler = _sample_first_hits(view, seed, spp, tile)
         if dr.width(film) == 0:
             return mi.Float(0)
-        si = hit.compute_surface_interaction(view.camera.ray(film), mi.RayFlags.All)
-    attached = view.follow(hit)[:3]
+        si = hit.compute_surface_interaction(
+            view.camera.make_ray(film), mi.RayFlags.All
+        )
+    attached = view.attach_hit(hit)[:3]
     leaves = [type(value)(dr.detach(value)) for value in attached]
     dr.enable_grad(leaves)
     point, facet, shading_normal = leaves
 
     # Sum of W L J / J over all samples, attached to these points and normals.
-    jacobian = dr.dot(facet, point - view.camera.eye) / view.camera.depth(point) ** 3
-    weight = view.weight(
+    jacobian = (
+        dr.dot(facet, point - view.camera.eye) / view.camera.compute_depth(point) ** 3
+    )
+    weight = view.interpolate_cotangent(
         dr.replace_grad(film, view.camera.project(point)), mi.Bool(True)
     )
     moving_si = _attach_interaction(view, si, point, facet, shading_normal)
     radiance = _sample_reflected(view, moving_si, si, sampler)
-    dr.backward(dr.sum(dr.sum(weight * radiance) * _relative(jacobian)))
+    dr.backward(dr.sum(dr.sum(weight * radiance) * _with_relative_gradient(jacobian)))
 
     # From there on to the vertices, without samples whose gradient is not finite.
     total = mi.Float(0)
@@ -213,15 +217,19 @@ def _sample_first_hits(
     tiles_across = -(-n_columns // tile)
     n_tiles = tiles_across * -(-n_rows // tile)
     tile_index = row // tile * tiles_across + column // tile
-    sampler = sampler_of(stream_of(seed, 0), n_tiles * spp, tile_index * spp + sample)
+    sampler = make_sampler(
+        make_stream(seed, 0), n_tiles * spp, tile_index * spp + sample
+    )
 
     strata_across = _largest_divisor(spp)
     strata_shape = mi.Point2f(strata_across, spp // strata_across)
     stratum = mi.Point2f(sample % strata_across, sample // strata_across)
     film = mi.Point2f(column, row) - 0.5 + (stratum + sampler.next_2d()) / strata_shape
-    hit = view.scene.ray_intersect_preliminary(view.camera.ray(film), coherent=True)
+    hit = view.scene.ray_intersect_preliminary(
+        view.camera.make_ray(film), coherent=True
+    )
     on_moving = mi.Bool(False)
-    for mesh in view.meshes:
+    for mesh in view.moving_meshes:
         on_moving |= hit.is_valid() & (hit.shape == mesh.shape)
     dr.eval(on_moving, film, hit, sampler)
     selected = dr.compress(on_moving)
@@ -236,7 +244,7 @@ def _largest_divisor(count: int) -> int:
     return max(n for n in range(1, int(count**0.5) + 1) if count % n == 0)
 
 
-def _relative(value: Any) -> Any:
+def _with_relative_gradient(value: Any) -> Any:
     """Return 1 with the relative gradient of a value.
 
     There is no gradient where the value is all but zero.
@@ -291,7 +299,10 @@ def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> 
         mi.BSDFContext(), moving_si, moving_si.to_local(wo), active & smooth
     )
     relative = mi.Color3f(
-        *(_relative(dr.select(smooth, channel, 1.0)) for channel in bsdf_value)
+        *(
+            _with_relative_gradient(dr.select(smooth, channel, 1.0))
+            for channel in bsdf_value
+        )
     )
     return direct + dr.select(active, incoming * relative, 0.0)
 
@@ -325,7 +336,7 @@ def _sample_incoming(
     smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
     ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
     # with all of what the next surface emits
-    L = view.radiance(ray, sampler, view.max_depth - 1, active)
+    L = view.sample_radiance(ray, sampler, view.max_depth - 1, active)
     si_next = view.scene.ray_intersect(ray, active)
     ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
     em_pdf = view.scene.pdf_emitter_direction(si, ds_next, active & smooth)
@@ -352,7 +363,7 @@ def _reflect_light(
         is_surface, dr.squared_norm(ds.p - moving_si.p), 1.0
     )
     em_weight = dr.replace_grad(em_weight, attached) * dr.select(
-        is_surface, _relative(falloff), 1.0
+        is_surface, _with_relative_gradient(falloff), 1.0
     )
     bsdf_value, bsdf_pdf = si.bsdf().eval_pdf(
         mi.BSDFContext(), moving_si, moving_si.to_local(ds.d), active

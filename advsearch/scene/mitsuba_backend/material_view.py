@@ -38,11 +38,11 @@ class Camera:
         position = self.to_film @ (self.to_local @ mi.Point3f(point))
         return mi.Point2f(position.x * self.width, position.y * self.height)
 
-    def depth(self, point: Any) -> Any:
+    def compute_depth(self, point: Any) -> Any:
         """Return the distance of a point along the viewing axis."""
         return dr.dot(point - self.eye, self.forward)
 
-    def ray(self, film: Any) -> Any:
+    def make_ray(self, film: Any) -> Any:
         """Return the ray through a film position in pixels."""
         near = self.to_film.inverse() @ mi.Point3f(
             film.x / self.width, film.y / self.height, 0.0
@@ -50,7 +50,7 @@ class Camera:
         direction = self.to_local.inverse() @ mi.Vector3f(near)
         return mi.Ray3f(self.eye, dr.normalize(direction))
 
-    def shows(self, film: Any) -> Any:
+    def is_in_frame(self, film: Any) -> Any:
         """Return whether a film position can count.
 
         The cotangent reaches half a pixel past the border.
@@ -71,29 +71,29 @@ class TriMesh:
     positions: Any  # flat Dr.Jit arrays, as the next two
     normals: Any
     faces: Any
-    smooth: bool  # whether shading normals are interpolated
+    is_smooth: bool  # whether shading normals are interpolated
     corners: Tensor  # (F, 3) int64
-    places: Tensor  # (V, 3) float64
+    vertices: Tensor  # (V, 3) float64
 
     @property
     def extent(self) -> float:
         """Largest width along an axis."""
-        return float((self.places.amax(dim=0) - self.places.amin(dim=0)).max())
+        return float((self.vertices.amax(dim=0) - self.vertices.amin(dim=0)).max())
 
-    def point(self, ends: Tensor, part: Tensor) -> Any:
+    def interpolate_edge(self, ends: Tensor, fraction: Tensor) -> Any:
         """Return points on edges, attached to the vertices.
 
         Args:
             ends: (n, 2) vertices of each edge.
-            part: (n,) position along the edge in [0, 1].
+            fraction: (n,) position along the edge in [0, 1].
         """
         first = mi.UInt32(ends[:, 0].to(torch.int32).contiguous())
         second = mi.UInt32(ends[:, 1].to(torch.int32).contiguous())
         a = dr.gather(mi.Point3f, self.positions, first)
         b = dr.gather(mi.Point3f, self.positions, second)
-        return dr.fma(b - a, as_numbers(part), a)
+        return dr.fma(b - a, to_drjit_float(fraction), a)
 
-    def gradients(self) -> dict[str, Tensor]:
+    def get_gradients(self) -> dict[str, Tensor]:
         """Return the gradients by vertices and by normals, (V, 3) each."""
         arrays = {
             f"{self.name}.vertices": self.positions,
@@ -115,9 +115,9 @@ class FilmView:
         max_depth: longest light path in segments.
 
     Attributes:
-        weights: the cotangent with a border of zeros, flat.
-        meshes: those that move, in the order of their vertices in `moving`.
-        still: those that stand still but may hide or shade them; a single rectangle is
+        padded_cotangent: the cotangent with a border of zeros, flat.
+        moving_meshes: those that move, in the order of their vertices in `moving`.
+        still_meshes: those that stand still but may hide or shade them; a single rectangle is
             left out.
     """
 
@@ -133,11 +133,11 @@ class FilmView:
         self.scene = scene
         self.camera = Camera(sensor)
         self.max_depth = max_depth
-        self.weights = as_array(
+        self.padded_cotangent = to_drjit_array(
             torch.nn.functional.pad(cotangent.detach(), (0, 0, 1, 1, 1, 1))
         )
         moving_meshes = dict[str, TriMesh]()
-        self.still = list[TriMesh]()
+        self.still_meshes = list[TriMesh]()
         for shape in scene.shapes():
             vertices_name = f"{shape.id()}.vertices"
             if vertices_name in moving:
@@ -150,31 +150,35 @@ class FilmView:
                 buffer = parameters[f"{shape.id()}.{POSITIONS}"]
                 positions = buffer.torch().reshape(-1, 3).clone()
                 normals = torch.zeros_like(positions)
-                self.still.append(_make_mesh(shape, parameters, positions, normals))
-        self.meshes = [moving_meshes[name] for name in moving if name in moving_meshes]
+                self.still_meshes.append(
+                    _make_mesh(shape, parameters, positions, normals)
+                )
+        self.moving_meshes = [
+            moving_meshes[name] for name in moving if name in moving_meshes
+        ]
 
-    def weight(self, film: Any, active: Any) -> Any:
+    def interpolate_cotangent(self, film: Any, active: Any) -> Any:
         """Return the cotangent at a film position, differentiable in the position.
 
         It is bilinear between pixel centers, and zero outside.
         """
         width = self.camera.width
         height = self.camera.height
-        active = active & self.camera.shows(dr.detach(film))
+        active = active & self.camera.is_in_frame(dr.detach(film))
         padded = film + 0.5
         base = dr.floor(dr.detach(padded))
         cell = mi.Point2u(dr.clip(base.x, 0, width), dr.clip(base.y, 0, height))
         fraction = padded - mi.Point2f(cell)
         corner = cell.y * (width + 2) + cell.x
         texels = [
-            dr.gather(mi.Color3f, self.weights, corner + offset, active)
+            dr.gather(mi.Color3f, self.padded_cotangent, corner + offset, active)
             for offset in (0, 1, width + 2, width + 3)
         ]
         top = dr.lerp(texels[0], texels[1], fraction.x)
         bottom = dr.lerp(texels[2], texels[3], fraction.x)
         return dr.lerp(top, bottom, fraction.y) & active
 
-    def follow(self, hit: Any) -> tuple[Any, Any, Any, Any]:
+    def attach_hit(self, hit: Any) -> tuple[Any, Any, Any, Any]:
         """Return the surface point of a hit, attached to the vertices.
 
         Returns:
@@ -187,7 +191,7 @@ class FilmView:
         shading_normal = mi.Normal3f(0, 0, 1)
         moves = mi.Bool(False)
         u, v = hit.prim_uv
-        for mesh in self.meshes:
+        for mesh in self.moving_meshes:
             on_mesh = hit.is_valid() & (hit.shape == mesh.shape)
             corners = dr.gather(mi.Point3u, mesh.faces, hit.prim_index, on_mesh)
             a, b, c = (
@@ -198,7 +202,7 @@ class FilmView:
             mesh_point = dr.fma(b - a, u, dr.fma(c - a, v, a))
             point = dr.select(on_mesh, mesh_point, point)
             facet = dr.select(on_mesh, normal, facet)
-            if mesh.smooth:
+            if mesh.is_smooth:
                 a, b, c = (
                     dr.gather(mi.Normal3f, mesh.normals, corner, on_mesh)
                     for corner in corners
@@ -208,7 +212,7 @@ class FilmView:
             moves = moves | on_mesh
         return point, facet, shading_normal, moves
 
-    def radiance(self, ray: Any, sampler: Any, depth: int, active: Any) -> Any:
+    def sample_radiance(self, ray: Any, sampler: Any, depth: int, active: Any) -> Any:
         """Sample the radiance that arrives along a ray, as a constant.
 
         Paths have up to `depth` segments.
@@ -228,12 +232,12 @@ def _make_mesh(
     return TriMesh(
         name=name,
         shape=mi.ShapePtr(shape),
-        positions=as_array(positions),
-        normals=as_array(normals),
+        positions=to_drjit_array(positions),
+        normals=to_drjit_array(normals),
         faces=faces,
-        smooth=bool(shape.has_vertex_normals()),
+        is_smooth=bool(shape.has_vertex_normals()),
         corners=faces.torch().reshape(-1, 3).to("cpu", torch.int64),
-        places=positions.detach().to("cpu", torch.float64),
+        vertices=positions.detach().to("cpu", torch.float64),
     )
 
 
@@ -260,7 +264,7 @@ class _Sampler:
         return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
 
 
-def sampler_of(stream: int, count: int, index: Any = None) -> Any:
+def make_sampler(stream: int, count: int, index: Any = None) -> Any:
     """Make a sampler with one of `count` random streams in every lane.
 
     Lanes with the same index have the same stream; without an index each has its own.
@@ -273,12 +277,12 @@ def sampler_of(stream: int, count: int, index: Any = None) -> Any:
     return sampler
 
 
-def stream_of(seed: int, purpose: int, number: int = 0) -> int:
+def make_stream(seed: int, purpose: int, index: int = 0) -> int:
     """Return a starting state below 2^63, far apart for neighbouring seeds."""
-    return (((seed * 64 + number) * 4 + purpose + 1) * 0x9E3779B97F4A7C15) % 2**63
+    return (((seed * 64 + index) * 4 + purpose + 1) * 0x9E3779B97F4A7C15) % 2**63
 
 
-def uniform_numbers(stream: int, count: int, dimensions: int) -> Tensor:
+def sample_uniform(stream: int, count: int, dimensions: int) -> Tensor:
     """Return (count, dimensions) float64 random numbers in [0, 1)."""
     return torch.rand(
         count,
@@ -288,21 +292,21 @@ def uniform_numbers(stream: int, count: int, dimensions: int) -> Tensor:
     )
 
 
-def as_array(tensor: Tensor) -> Any:
+def to_drjit_array(tensor: Tensor) -> Any:
     return mi.TensorXf(tensor.detach().to("cpu", torch.float32).contiguous()).array
 
 
-def as_numbers(tensor: Tensor) -> Any:
+def to_drjit_float(tensor: Tensor) -> Any:
     return mi.Float(tensor.to(torch.float32).contiguous())
 
 
-def as_vectors(kind: Any, tensor: Tensor) -> Any:
-    return kind(*(as_numbers(tensor[:, axis]) for axis in range(3)))
+def to_drjit_vectors(kind: Any, tensor: Tensor) -> Any:
+    return kind(*(to_drjit_float(tensor[:, axis]) for axis in range(3)))
 
 
-def film_places(camera: Camera, places: Tensor) -> Tensor:
+def project_to_film(camera: Camera, points: Tensor) -> Tensor:
     """Return the (n, 2) float64 film positions of (n, 3) points."""
-    film = camera.project(as_vectors(mi.Point3f, places))
+    film = camera.project(to_drjit_vectors(mi.Point3f, points))
     return torch.stack([film.x.torch(), film.y.torch()], dim=1).to("cpu", torch.float64)
 
 
@@ -313,38 +317,40 @@ EDGE_OFFSET = 0.01  # pixels past an outline at which we look for what is behind
 DEPTH_TOLERANCE = 1e-3
 # how far past an edge a shadow ray passes, in extents of the mesh
 SHADOW_OFFSET = 1e-4
-GRAZING = 0.02  # smallest cosine at a lit point that is divided by
+MIN_COSINE = 0.02  # smallest cosine at a lit point that is divided by
 # smallest depth of an edge that is used, in world units; there is no clipping of edges
-NEAREST = 1e-3
+MIN_DEPTH = 1e-3
 
 
-def outline_terms(
-    view: FilmView, mesh: TriMesh, seed: int, number: int, spp: int
+def compute_outline_term(
+    view: FilmView, mesh: TriMesh, seed: int, mesh_index: int, spp: int
 ) -> Any:
     """Return a value whose gradient is the outline term of one mesh.
 
-    `number` is the index of the mesh, `spp` the samples in multiples of the number of
+    `mesh_index` is the index of the mesh, `spp` the samples in multiples of the number of
     pixels.
     """
-    stream = stream_of(seed, _OUTLINES, number)
-    random = uniform_numbers(stream, spp * view.camera.pixels, 1)[:, 0]
+    stream = make_stream(seed, _OUTLINES, mesh_index)
+    random = sample_uniform(stream, spp * view.camera.pixels, 1)[:, 0]
     sampled = _sample_outline(view.camera, mesh, random)
     if sampled is None:
         return mi.Float(0)
-    n = mi.Vector2f(as_numbers(sampled.normal[:, 0]), as_numbers(sampled.normal[:, 1]))
-    edge = mesh.point(sampled.ends, sampled.fraction)
+    n = mi.Vector2f(
+        to_drjit_float(sampled.normal[:, 0]), to_drjit_float(sampled.normal[:, 1])
+    )
+    edge = mesh.interpolate_edge(sampled.ends, sampled.fraction)
     film = view.camera.project(edge)
     with dr.suspend_grad():
-        ray = view.camera.ray(dr.detach(film) + EDGE_OFFSET * n)
+        ray = view.camera.make_ray(dr.detach(film) + EDGE_OFFSET * n)
         hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
         edge_distance = dr.norm(dr.detach(edge) - view.camera.eye)
         is_visible = ~hit.is_valid() | (hit.t > edge_distance * (1.0 - DEPTH_TOLERANCE))
-        sampler = sampler_of(stream + _PATHS, len(sampled.fraction))
-        behind = view.radiance(ray, sampler, view.max_depth, is_visible)
-        strength = dr.sum(view.weight(film, is_visible) * behind)
+        sampler = make_sampler(stream + _PATHS, len(sampled.fraction))
+        behind = view.sample_radiance(ray, sampler, view.max_depth, is_visible)
+        strength = dr.sum(view.interpolate_cotangent(film, is_visible) * behind)
         strength = dr.select(is_visible & dr.isfinite(strength), strength, 0.0)
         dr.eval(strength, hit)
-    point_behind, _, _, moves = view.follow(hit)
+    point_behind, _, _, moves = view.attach_hit(hit)
     film_behind = dr.select(moves, view.camera.project(point_behind), 0.0)
     speed = dr.dot(n, film - film_behind)
     return dr.sum(strength * speed) * -sampled.pixels_per_sample
@@ -371,12 +377,12 @@ def _sample_outline(
     ends, outwards = _find_outline(mesh, eye)
     if len(ends) == 0 or len(random) == 0:
         return None
-    a = film_places(camera, mesh.places[ends[:, 0]])
-    b = film_places(camera, mesh.places[ends[:, 1]])
-    depth = (mesh.places[ends] - eye) @ forward
+    a = project_to_film(camera, mesh.vertices[ends[:, 0]])
+    b = project_to_film(camera, mesh.vertices[ends[:, 1]])
+    depth = (mesh.vertices[ends] - eye) @ forward
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
     on_film = (torch.maximum(a, b) > -0.5) & (torch.minimum(a, b) < size + 0.5)
-    is_used = (depth > NEAREST).all(dim=1) & on_film.all(dim=1)
+    is_used = (depth > MIN_DEPTH).all(dim=1) & on_film.all(dim=1)
     length = torch.where(is_used, (b - a).norm(dim=1), 0.0)
     if not float(length.sum()) > 0.0:
         return None
@@ -387,10 +393,10 @@ def _sample_outline(
     normal = torch.nn.functional.normalize(
         torch.stack([edge[:, 1], -edge[:, 0]], dim=1), dim=1
     )
-    middle = mesh.places[ends].mean(dim=1)
-    step = film_places(camera, middle + 1e-3 * mesh.extent * outwards) - film_places(
-        camera, middle
-    )
+    middle = mesh.vertices[ends].mean(dim=1)
+    step = project_to_film(
+        camera, middle + 1e-3 * mesh.extent * outwards
+    ) - project_to_film(camera, middle)
     points_inwards = (normal * step[pick]).sum(dim=1, keepdim=True) < 0.0
     normal = normal * torch.where(points_inwards, -1.0, 1.0)
 
@@ -411,12 +417,12 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
         (E, 2) vertices of the edges, and (E, 3) that plane's unit normal, away from the
         mesh.
     """
-    ends, owner, across = _find_edges(mesh.places, mesh.corners)
+    ends, owner, across = _find_edges(mesh.vertices, mesh.corners)
     plane = torch.linalg.cross(
-        mesh.places[ends[:, 0]] - eye, mesh.places[ends[:, 1]] - eye
+        mesh.vertices[ends[:, 0]] - eye, mesh.vertices[ends[:, 1]] - eye
     )
     plane = torch.nn.functional.normalize(plane, dim=1)
-    side = (plane[owner] * (mesh.places[across] - eye)).sum(dim=1)
+    side = (plane[owner] * (mesh.vertices[across] - eye)).sum(dim=1)
     lowest = torch.full((len(ends),), torch.inf, dtype=side.dtype).scatter_reduce(
         0, owner, side, "amin"
     )
@@ -442,18 +448,18 @@ def _sample_along(length: Tensor, random: Tensor) -> tuple[Tensor, Tensor]:
     return pick, fraction
 
 
-def _find_edges(places: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _find_edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Find the edges of a mesh; vertices at the same position count as one.
 
     Returns:
         (E, 2) vertices of each edge; and for each of the 3 F sides of faces, (3 F,) the
         index of its edge and (3 F,) the vertex across.
     """
-    position_id = torch.unique(places, dim=0, return_inverse=True)[1]
+    position_id = torch.unique(vertices, dim=0, return_inverse=True)[1]
     sides = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     across = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
     lower, higher = position_id[sides].aminmax(dim=1)
-    keys, owner = torch.unique(lower * len(places) + higher, return_inverse=True)
+    keys, owner = torch.unique(lower * len(vertices) + higher, return_inverse=True)
     side_index = torch.arange(len(owner))
     # repeatable, unlike indexing
     first = torch.full((len(keys),), len(owner)).scatter_reduce(
@@ -462,32 +468,32 @@ def _find_edges(places: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor
     return sides[first], owner, across
 
 
-def shadow_terms(
-    view: FilmView, mesh: TriMesh, seed: int, number: int, spp: int
+def compute_shadow_term(
+    view: FilmView, mesh: TriMesh, seed: int, mesh_index: int, spp: int
 ) -> Any:
     """Return a value whose gradient is the shadow term of one mesh.
 
-    `number` is the index of the mesh, `spp` the samples in multiples of the number of
+    `mesh_index` is the index of the mesh, `spp` the samples in multiples of the number of
     pixels.
     """
-    stream = stream_of(seed, _SHADOWS, number)
-    random = uniform_numbers(stream, spp * view.camera.pixels, 4)
+    stream = make_stream(seed, _SHADOWS, mesh_index)
+    random = sample_uniform(stream, spp * view.camera.pixels, 4)
     sampled = _sample_tangents(mesh, random)
     if sampled is None:
         return mi.Float(0)
     ends, fraction, direction = sampled.ends, sampled.fraction, sampled.direction
     edge_points = torch.lerp(
-        mesh.places[ends[:, 0]], mesh.places[ends[:, 1]], fraction[:, None]
+        mesh.vertices[ends[:, 0]], mesh.vertices[ends[:, 1]], fraction[:, None]
     )
-    p = as_vectors(mi.Point3f, edge_points)
-    d = as_vectors(mi.Vector3f, direction)
-    n = as_vectors(mi.Vector3f, sampled.normal)
+    p = to_drjit_vectors(mi.Point3f, edge_points)
+    d = to_drjit_vectors(mi.Vector3f, direction)
+    n = to_drjit_vectors(mi.Vector3f, sampled.normal)
     offset = SHADOW_OFFSET * mesh.extent * n
     with dr.suspend_grad():
         ray = mi.Ray3f(p + offset, -d)
         hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, hit.is_valid())
-        lit = _lit_value(view, si, d)
+        lit = _eval_lit_points(view, si, d)
         dr.eval(lit, hit, si, p, offset)
         lit_index = dr.compress(dr.any(lit != 0.0))
         if dr.width(lit_index) == 0:
@@ -496,27 +502,31 @@ def shadow_terms(
             dr.gather(type(value), value, lit_index)
             for value in (lit, hit, si, p, offset, n)
         )
-        strength = dr.sum(lit * _past_minus_hit(view, si, p, offset, stream))
+        strength = dr.sum(
+            lit * _sample_radiance_difference(view, si, p, offset, stream)
+        )
         strength = dr.select(dr.isfinite(strength), strength, 0.0)
         dr.eval(strength, hit)
     selected = lit_index.torch().to("cpu", torch.int64)
-    lit_point, _, _, moves = view.follow(hit)
-    sine = torch.linalg.cross(direction, _unit_edges(mesh.places, ends)).norm(dim=1)
-    edge_point = mesh.point(ends[selected], fraction[selected])
+    lit_point, _, _, moves = view.attach_hit(hit)
+    sine = torch.linalg.cross(
+        direction, _compute_edge_directions(mesh.vertices, ends)
+    ).norm(dim=1)
+    edge_point = mesh.interpolate_edge(ends[selected], fraction[selected])
     speed = dr.dot(n, edge_point - dr.select(moves, lit_point, 0.0))
     return (
-        dr.sum(strength * as_numbers(sine[selected]) * speed)
+        dr.sum(strength * to_drjit_float(sine[selected]) * speed)
         * -sampled.measure_per_sample
     )
 
 
-def _lit_value(view: FilmView, si: Any, d: Any) -> Any:
+def _eval_lit_points(view: FilmView, si: Any, d: Any) -> Any:
     """Return W f J' of lit points that the camera sees, for light from d; else 0."""
     camera = view.camera
     film = camera.project(si.p)
-    depth = camera.depth(si.p)
+    depth = camera.compute_depth(si.p)
     to_eye = camera.eye - si.p
-    active = si.is_valid() & (depth > NEAREST) & camera.shows(film)
+    active = si.is_valid() & (depth > MIN_DEPTH) & camera.is_in_frame(film)
     si.wi = si.to_local(dr.normalize(to_eye))
     value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(d), active)
     active &= dr.any(value > 0.0)
@@ -527,11 +537,13 @@ def _lit_value(view: FilmView, si: Any, d: Any) -> Any:
         float(matrix[0, 0][0]) * camera.width * float(matrix[1, 1][0]) * camera.height
     )
     scale = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * pixel_area
-    value *= scale / dr.maximum(dr.abs(dr.dot(si.n, d)), GRAZING)
-    return dr.select(active, value * view.weight(film, active), 0.0)
+    value *= scale / dr.maximum(dr.abs(dr.dot(si.n, d)), MIN_COSINE)
+    return dr.select(active, value * view.interpolate_cotangent(film, active), 0.0)
 
 
-def _past_minus_hit(view: FilmView, si: Any, p: Any, offset: Any, stream: int) -> Any:
+def _sample_radiance_difference(
+    view: FilmView, si: Any, p: Any, offset: Any, stream: int
+) -> Any:
     """Return the radiance that a lit point gets just past an edge minus just inside."""
 
     def make_ray(target: Any) -> Any:
@@ -543,8 +555,10 @@ def _past_minus_hit(view: FilmView, si: Any, p: Any, offset: Any, stream: int) -
     is_free = ~first.is_valid() | (first.t > reach)
 
     def sample_radiance(target: Any) -> Any:
-        sampler = sampler_of(stream + _PATHS, dr.width(p))
-        return view.radiance(make_ray(target), sampler, view.max_depth - 1, is_free)
+        sampler = make_sampler(stream + _PATHS, dr.width(p))
+        return view.sample_radiance(
+            make_ray(target), sampler, view.max_depth - 1, is_free
+        )
 
     past = sample_radiance(p + offset)
     inside = sample_radiance(p - offset)
@@ -574,7 +588,7 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
     Returns:
         The samples; None if there is nothing to sample.
     """
-    places = mesh.places
+    places = mesh.vertices
     edges = _measure_exterior_angles(mesh)
     edge_length = (places[edges.ends[:, 1]] - places[edges.ends[:, 0]]).norm(dim=1)
     measure = edge_length * edges.angle
@@ -619,7 +633,7 @@ class _ExteriorAngles(NamedTuple):
 
 
 def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
-    places = mesh.places
+    places = mesh.vertices
     ends, owner, across = _find_edges(places, mesh.corners)
     order = torch.argsort(owner, stable=True)
     n_faces = torch.bincount(owner, minlength=len(ends))
@@ -628,7 +642,7 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     proper = (n_faces <= 2) & (length > 0.0)
     ends = ends[proper]
     is_single = n_faces[proper] == 1
-    axis = _unit_edges(places, ends)
+    axis = _compute_edge_directions(places, ends)
 
     def along_face(entry: Tensor) -> Tensor:
         """Return unit vectors along one of an edge's faces, perpendicular to it."""
@@ -650,6 +664,8 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     return _ExteriorAngles(ends, axis, first, second, turned, angle)
 
 
-def _unit_edges(places: Tensor, ends: Tensor) -> Tensor:
+def _compute_edge_directions(vertices: Tensor, ends: Tensor) -> Tensor:
     """Return unit vectors (n, 3) along edges with vertices (n, 2)."""
-    return torch.nn.functional.normalize(places[ends[:, 1]] - places[ends[:, 0]], dim=1)
+    return torch.nn.functional.normalize(
+        vertices[ends[:, 1]] - vertices[ends[:, 0]], dim=1
+    )

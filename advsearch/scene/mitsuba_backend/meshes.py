@@ -13,7 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Doubles, Floats, Mesh, face_vectors
+from advsearch.scene.assets import (
+    Float32Array,
+    Float64Array,
+    Mesh,
+    compute_area_vectors,
+)
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, MeshPart
@@ -26,14 +31,21 @@ FACES = "faces"
 
 They are flat arrays of 3, 3 and 2 numbers per vertex, and 3 indices per face.
 """
-LEAST = 0.2  # see `sampling_weights`
-RENDERED = {"metallic": (0.0, 0.999), "specular": (1e-3, 1.0), "clearcoat": (1e-4, 1.0)}
+MIN_WEIGHT_FRACTION = 0.2  # see `compute_sampling_weights`
+RENDERED_RANGES = {
+    "metallic": (0.0, 0.999),
+    "specular": (1e-3, 1.0),
+    "clearcoat": (1e-4, 1.0),
+}
 """Ranges of numbers of the principled surface that Mitsuba renders correctly.
 
 At an end of their full range they are rendered or differentiated wrongly: a value
 beyond is clamped to this range, wherever it comes from (docs/controls/material.md).
 """
-DARK = {"specular": (0.0, RENDERED["specular"][0]), "eta": (1.0, 1.001)}
+BLACK_METAL_VALUES = {
+    "specular": (0.0, RENDERED_RANGES["specular"][0]),
+    "eta": (1.0, 1.001),
+}
 """Values of a user's principled surface at which metal would be black.
 
 Mitsuba takes the second value in place of the first where the value is set later, but
@@ -41,7 +53,7 @@ not where a file has it.
 """
 
 
-def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
+def make_principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
     """Return the surface of a mesh, with cut-outs and normal map.
 
     It is a two-sided principled BSDF with the base color as a bilinear texture of
@@ -54,91 +66,92 @@ def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
     material = part.material
     surface: Plugin = {
         "type": "principled",
-        "base_color": texture(srgb_to_linear(part.base_color)),
+        "base_color": make_texture(srgb_to_linear(part.base_color)),
         "roughness": material.roughness,
-        "metallic": rendered("metallic", material.metallic),
-        "specular": rendered("specular", material.specular),
+        "metallic": clamp_to_rendered("metallic", material.metallic),
+        "specular": clamp_to_rendered("specular", material.specular),
         **(extra or {}),
     }
     if material.clearcoat > 0.0:
-        surface["clearcoat"] = rendered("clearcoat", material.clearcoat)
+        surface["clearcoat"] = clamp_to_rendered("clearcoat", material.clearcoat)
     bsdf: Plugin = {"type": "twosided", "bsdf": surface}
     if part.normal_map is not None:
         bsdf = {
             "type": "normalmap",
-            "normalmap": texture(part.normal_map),
+            "normalmap": make_texture(part.normal_map),
             "bsdf": bsdf,
         }
     if part.opacity is not None:
         bsdf = {
             "type": "mask",
-            "opacity": texture(part.opacity[:, :, None]),
+            "opacity": make_texture(part.opacity[:, :, None]),
             "bsdf": bsdf,
         }
     return bsdf
 
 
-def rendered(name: str, value: float) -> float:
+def clamp_to_rendered(name: str, value: float) -> float:
     """Return the value that is rendered for a number of the principled surface."""
-    lower, upper = RENDERED.get(name, (0.0, 1.0))
+    lower, upper = RENDERED_RANGES.get(name, (0.0, 1.0))
     return min(max(value, lower), upper)
 
 
-def emitter(part: MeshPart) -> Plugin | None:
+def make_emitter(part: MeshPart) -> Plugin | None:
     """Return the light that a mesh emits from the front of its faces, or None."""
     if part.emission is None:
         return None
-    if textured_emission(part):
-        return {"type": "area", "radiance": texture(part.emission)}
+    if has_textured_emission(part):
+        return {"type": "area", "radiance": make_texture(part.emission)}
     return {
         "type": "area",
         "radiance": {"type": "rgb", "value": part.emission[0, 0].tolist()},
     }
 
 
-def sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
+def compute_sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
     """Return how often light is sampled from each mesh that emits some, by its name.
 
     The environment has a weight of 1. All meshes together have 1 too, by their power;
-    however small that is, each has at least `LEAST` of an equal fraction.
+    however small that is, each has at least `MIN_WEIGHT_FRACTION` of an equal fraction.
     """
     powers: dict[str, float] = {}
     for part in parts:
         if part.emission is not None:
             vertices = part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T
-            vectors = face_vectors(vertices[part.mesh.faces])
+            vectors = compute_area_vectors(vertices[part.mesh.faces])
             doubled_area = np.linalg.norm(vectors, axis=1).sum()
             powers[part.name] = float(part.emission.mean() * doubled_area)
     total = max(sum(powers.values()), 1e-30)  # of faces without area it is 0
     return {
-        name: (1.0 - LEAST) * power / total + LEAST / len(powers)
+        name: (1.0 - MIN_WEIGHT_FRACTION) * power / total
+        + MIN_WEIGHT_FRACTION / len(powers)
         for name, power in powers.items()
     }
 
 
-def textured_emission(part: MeshPart) -> bool:
+def has_textured_emission(part: MeshPart) -> bool:
     """Return whether a mesh emits light that varies over its surface."""
     return part.emission is not None and part.emission.shape != (1, 1, 3)
 
 
-def matt(reflectance: Floats) -> Plugin:
+def make_diffuse(reflectance: Float32Array) -> Plugin:
     """Return a two-sided diffuse BSDF with a bilinear texture of linear reflectance.
 
     The texture is (h, w, 3), row 0 at v = 1.
     """
     return {
         "type": "twosided",
-        "bsdf": {"type": "diffuse", "reflectance": texture(reflectance)},
+        "bsdf": {"type": "diffuse", "reflectance": make_texture(reflectance)},
     }
 
 
-def texture(linear: Floats) -> Plugin:
+def make_texture(linear: Float32Array) -> Plugin:
     """Return a bilinear texture (h, w, channels) of linear values, row 0 at v = 1."""
     bitmap = mi.Bitmap(np.ascontiguousarray(linear, dtype=np.float32))
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear"}
 
 
-def with_inner(
+def map_inner_plugins(
     plugin: Mapping[str, object], change: Callable[[Mapping[str, object]], object]
 ) -> Plugin:
     """Return a plugin whose inner plugins are changed."""
@@ -148,7 +161,7 @@ def with_inner(
     }
 
 
-def own_surface(
+def fill_base_color(
     surface: Mapping[str, object], fill: Callable[[Mapping[str, object]], object]
 ) -> Plugin:
     """Return one of Mitsuba's surfaces with its base color put in.
@@ -161,27 +174,29 @@ def own_surface(
     def fill_in(plugin: Mapping[str, object]) -> object:
         if plugin.get("type") == BASE_COLOR:
             return fill({key: entry for key, entry in plugin.items() if key != "type"})
-        return with_inner(plugin, fill_in)
+        return map_inner_plugins(plugin, fill_in)
 
-    return loadable(with_inner(surface, fill_in))
+    return to_loadable(map_inner_plugins(surface, fill_in))
 
 
-def base_texture(base_color: Floats, options: Mapping[str, object]) -> Plugin:
+def make_base_texture(
+    base_color: Float32Array, options: Mapping[str, object]
+) -> Plugin:
     """Return a display-referred base color (h, w, 3) as a linear texture.
 
     The options are how it is looked up.
     """
-    return {**texture(srgb_to_linear(base_color)), **loadable(options)}
+    return {**make_texture(srgb_to_linear(base_color)), **to_loadable(options)}
 
 
-def repeating(
+def to_repeating_uv(
     uv: Tensor, options: Mapping[str, object], size: tuple[int, int]
 ) -> Tensor:
     """Convert texture coordinates for a texture that repeats and is interpolated.
 
     Args:
         uv: (n, 2) float32, as Mitsuba has them.
-        options: how the texture is really looked up, see `base_texture`.
+        options: how the texture is really looked up, see `make_base_texture`.
         size: rows and columns of the texture.
 
     Returns:
@@ -201,8 +216,12 @@ def repeating(
     return uv
 
 
-def mitsuba_mesh(
-    name: str, mesh: Mesh, to_world: Doubles, bsdf: Plugin, light: Plugin | None = None
+def make_mitsuba_mesh(
+    name: str,
+    mesh: Mesh,
+    to_world: Float64Array,
+    bsdf: Plugin,
+    light: Plugin | None = None,
 ) -> Any:
     """Make a Mitsuba mesh under a pose, with shading normals and texture coordinates.
 
@@ -236,23 +255,23 @@ def mitsuba_mesh(
     return plugin
 
 
-def loadable(plugin: Mapping[str, object]) -> Plugin:
+def to_loadable(plugin: Mapping[str, object]) -> Plugin:
     """Return a dictionary that Mitsuba loads.
 
     It has Mitsuba's transforms for arrays (4, 4) and (3, 3), its bitmaps for images
-    (H, W, C), and principled surfaces without the values of `DARK`.
+    (H, W, C), and principled surfaces without the values of `BLACK_METAL_VALUES`.
     """
-    entries = {key: _loadable_entry(value) for key, value in plugin.items()}
+    entries = {key: _to_loadable_entry(value) for key, value in plugin.items()}
     if entries.get("type") == "principled":
-        for name, (dark, smallest) in DARK.items():
+        for name, (dark, smallest) in BLACK_METAL_VALUES.items():
             if entries.get(name) == dark:
                 entries[name] = smallest
     return entries
 
 
-def _loadable_entry(value: object) -> object:
+def _to_loadable_entry(value: object) -> object:
     if isinstance(value, Mapping):
-        return loadable(value)
+        return to_loadable(value)
     if not isinstance(value, np.ndarray):
         return value
     if value.shape == (4, 4):
@@ -262,17 +281,17 @@ def _loadable_entry(value: object) -> object:
     return mi.Bitmap(np.ascontiguousarray(value, dtype=np.float32))
 
 
-def plain(plugin: Mapping[str, object]) -> Plugin:
+def to_plain(plugin: Mapping[str, object]) -> Plugin:
     """Return a dictionary with arrays for Mitsuba's transforms.
 
     They are (4, 4), and (3, 3) for texture coordinates.
     """
-    return {key: _plain_entry(value) for key, value in plugin.items()}
+    return {key: _to_plain_entry(value) for key, value in plugin.items()}
 
 
-def _plain_entry(value: object) -> object:
+def _to_plain_entry(value: object) -> object:
     if isinstance(value, Mapping):
-        return plain(value)
+        return to_plain(value)
     matrix = getattr(value, "matrix", None)
     if matrix is None:
         return value

@@ -14,23 +14,26 @@ from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.mitsuba_backend.parts import color, number
+from advsearch.scene.mitsuba_backend.parts import to_color, to_flat_array
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mi
-from advsearch.scene.mitsuba_backend.writing import NAME as NAME
-from advsearch.scene.mitsuba_backend.writing import SCATTERINGS as SCATTERINGS
+from advsearch.scene.mitsuba_backend.writing import EXTRA_DEPTH as EXTRA_DEPTH
+from advsearch.scene.mitsuba_backend.writing import SCENE_FILE_NAME as SCENE_FILE_NAME
 from advsearch.scene.mitsuba_backend.writing import write_scene as write_scene
 from advsearch.scene.parts import PluginNumber
 from advsearch.scene.settings import CHANNELS
 
-SMALL = (8, 8)  # height and width of a scene of which only the keys are read
-BEHIND = ("differences",)  # valid estimators where Mitsuba has no derivative
-STILL = ("adjoint", *BEHIND)  # where Mitsuba has one, and no outline moves
+SMALL_RESOLUTION = (8, 8)  # height and width of a scene of which only the keys are read
+DIFFERENCES_ONLY = ("differences",)  # valid estimators where Mitsuba has no derivative
+ADJOINT_FIRST = (
+    "adjoint",
+    *DIFFERENCES_ONLY,
+)  # where Mitsuba has one, and no outline moves
 # where Mitsuba has one, but for what changes at an outline or all at once
-UNSURE = (*BEHIND, "adjoint")
+DIFFERENCES_FIRST = (*DIFFERENCES_ONLY, "adjoint")
 
 
-def plugin_numbers(
+def find_plugin_numbers(
     description: SceneDescription, name: str, keys: tuple[str, ...]
 ) -> tuple[PluginNumber, ...]:
     """Return some numbers and colors of a scene by Mitsuba's keys, each once.
@@ -77,11 +80,11 @@ def _find_numbers(
     Returns:
         They by their key, with an input if they have one; and the type of the rest.
     """
-    scene = MitsubaScene(description, SMALL)
+    scene = MitsubaScene(description, SMALL_RESOLUTION)
     inputs = {
         key: name
-        for name, (key, scene_input) in scene.declared.items()
-        if scene_input.write in (number, color)
+        for name, (key, scene_input) in scene.declared_inputs.items()
+        if scene_input.write in (to_flat_array, to_color)
     }
     numbers: dict[str, PluginNumber] = {}
     other_types: dict[str, str] = {}
@@ -106,13 +109,13 @@ def _find_numbers(
 def _valid_estimators(flags: int) -> tuple[str, ...]:
     """Return the estimators that are valid for a parameter with Mitsuba's flags."""
     if flags & mi.ParamFlags.NonDifferentiable.value:
-        return BEHIND
+        return DIFFERENCES_ONLY
     if flags == mi.ParamFlags.Differentiable.value:
-        return STILL
-    return UNSURE
+        return ADJOINT_FIRST
+    return DIFFERENCES_FIRST
 
 
-def sunsky_tables() -> tuple[Tensor, Tensor, Tensor]:
+def read_sunsky_tables() -> tuple[Tensor, Tensor, Tensor]:
     """Read the coefficients of Hosek and Wilkie's sky and sun that Mitsuba brings.
 
     They are the RGB ones of its `sunsky` plugin.

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from advsearch.scene.assets import Doubles, Floats, Ints
-from advsearch.scene.camera_model import NUMBERS, CameraModel
+from advsearch.scene.assets import Float32Array, Float64Array, IntArray
+from advsearch.scene.camera_model import NUMBER_NAMES, CameraModel
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 # Raindrops on a sheet of glass before the camera: small lenses that refract rays.
@@ -28,19 +28,21 @@ from advsearch.scene.mitsuba_backend.variant import dr, mi
 #
 # Only directions change: the scene is taken to be far away compared to the sheet.
 
-WATER = 1.33  # index of refraction
-DISTANCE = 60.0  # of the sheet from the camera, millimetres
-APERTURE = 1.0  # radius of the camera's aperture, millimetres
+WATER_IOR = 1.33  # index of refraction
+SHEET_DISTANCE = 60.0  # of the sheet from the camera, millimetres
+APERTURE_RADIUS = 1.0  # radius of the camera's aperture, millimetres
 # range of angles between a drop's surface and the glass at its rim, degrees
-CONTACT = (25.0, 42.0)
-SPREAD = 0.45  # standard deviation of the logarithm of radii
-BEYOND = 1.1  # half width of the square with drops, in half widths of the image
-GRID = 1024  # cells along each side of the grid that holds the drop of a position
+CONTACT_ANGLES = (25.0, 42.0)
+LOG_RADIUS_SPREAD = 0.45  # standard deviation of the logarithm of radii
+SHEET_HALF_WIDTH = (
+    1.1  # half width of the square with drops, in half widths of the image
+)
+GRID_SIZE = 1024  # cells along each side of the grid that holds the drop of a position
 
 
-def raindrops(
+def sample_raindrops(
     count: int, size: float, seed: int, tangent: float
-) -> tuple[float, Floats, Ints]:
+) -> tuple[float, Float32Array, IntArray]:
     """Sample raindrops on a square of the glass sheet before a camera.
 
     Args:
@@ -57,20 +59,24 @@ def raindrops(
         along y; `count` where there is none.
     """
     random = np.random.default_rng(seed)
-    half_width = BEYOND * DISTANCE * tangent
+    half_width = SHEET_HALF_WIDTH * SHEET_DISTANCE * tangent
     centers = random.uniform(-half_width, half_width, (count, 2))
-    radii = size * np.exp(SPREAD * random.standard_normal(count).clip(-2.5, 2.5))
-    contact_angles = np.radians(random.uniform(*CONTACT, count))
+    radii = size * np.exp(
+        LOG_RADIUS_SPREAD * random.standard_normal(count).clip(-2.5, 2.5)
+    )
+    contact_angles = np.radians(random.uniform(*CONTACT_ANGLES, count))
     curvature_radii = radii / np.sin(contact_angles)
     drops = np.column_stack([centers, radii, curvature_radii])
     return half_width, drops.astype(np.float32), _find_highest_drops(drops, half_width)
 
 
-def _find_highest_drops(drops: Doubles, half_width: float) -> Ints:
-    """Return the index of the highest drop in each cell, as in `raindrops`."""
-    cell_centers = (np.arange(GRID) + 0.5) / GRID * 2.0 * half_width - half_width
-    highest_drop = np.full((GRID, GRID), len(drops))
-    highest = np.zeros((GRID, GRID))
+def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
+    """Return the index of the highest drop in each cell, as in `sample_raindrops`."""
+    cell_centers = (
+        np.arange(GRID_SIZE) + 0.5
+    ) / GRID_SIZE * 2.0 * half_width - half_width
+    highest_drop = np.full((GRID_SIZE, GRID_SIZE), len(drops))
+    highest = np.zeros((GRID_SIZE, GRID_SIZE))
     for index, (x, y, radius, curvature_radius) in enumerate(drops):
         rows = np.flatnonzero(np.abs(cell_centers - y) <= radius)
         columns = np.flatnonzero(np.abs(cell_centers - x) <= radius)
@@ -91,9 +97,9 @@ def _find_highest_drops(drops: Doubles, half_width: float) -> Ints:
 
 
 common: Any = mi.ad.integrators.common
-PHASE = 1.0 / (4.0 * math.pi)  # isotropic phase function, per steradian
-NO_EXTINCTION = 1e-20
-MOST_SCATTERINGS = 8
+ISOTROPIC_PHASE = 1.0 / (4.0 * math.pi)  # isotropic phase function, per steradian
+MIN_EXTINCTION = 1e-20
+MAX_SCATTERINGS = 8
 """Largest number of scatterings in the haze along a path.
 
 They do not count as bounces off surfaces, so that haze of density 0 is no haze. Where
@@ -165,7 +171,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         prev_pdf = mi.Float(1)
         prev_delta = mi.Bool(True)
 
-        max_events = self.max_depth + MOST_SCATTERINGS
+        max_events = self.max_depth + MAX_SCATTERINGS
         while dr.hint(
             active, max_iterations=max_events, label=f"Haze path ({mode.name})"
         ):
@@ -194,7 +200,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
 
             # ---- direct light of emitters, through the haze
             may_bounce = si.is_valid() & (bounces + 1 < self.max_depth)
-            may_scatter = scatterings < MOST_SCATTERINGS
+            may_scatter = scatterings < MAX_SCATTERINGS
             active_next = active & (
                 (scattered & may_scatter) | (~scattered & may_bounce)
             )
@@ -210,8 +216,8 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
                 bsdf_value_em, bsdf_pdf_em = bsdf.eval_pdf(
                     context, si, si.to_local(ds_em.d), active_em & at_surface
                 )
-                bsdf_value_em = dr.select(scattered, PHASE, bsdf_value_em)
-                bsdf_pdf_em = dr.select(scattered, PHASE, bsdf_pdf_em)
+                bsdf_value_em = dr.select(scattered, ISOTROPIC_PHASE, bsdf_value_em)
+                bsdf_pdf_em = dr.select(scattered, ISOTROPIC_PHASE, bsdf_pdf_em)
                 mis = dr.select(
                     ds_em.delta, 1.0, common.mis_weight(ds_em.pdf, bsdf_pdf_em)
                 )
@@ -249,7 +255,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
 
             ray = event.spawn_ray(direction)
             prev = event
-            prev_pdf = dr.select(scattered, PHASE, bsdf_sample.pdf)
+            prev_pdf = dr.select(scattered, ISOTROPIC_PHASE, bsdf_sample.pdf)
             prev_delta = ~scattered & mi.has_flag(
                 bsdf_sample.sampled_type, mi.BSDFFlags.Delta
             )
@@ -301,13 +307,13 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         )
         extinction = extinction[0]
         flight = -dr.log(1.0 - sampler.next_1d()) / dr.maximum(
-            dr.detach(extinction), NO_EXTINCTION
+            dr.detach(extinction), MIN_EXTINCTION
         )
         scattered = active & (flight < haze_length)
         transmittance = dr.exp(-extinction * dr.minimum(flight, haze_length))
         weight = dr.select(scattered, scattering * transmittance, transmittance)
         albedo = dr.detach(scattering) / dr.maximum(
-            dr.detach(extinction), NO_EXTINCTION
+            dr.detach(extinction), MIN_EXTINCTION
         )
         return scattered, flight, weight, albedo, extinction
 
@@ -422,13 +428,13 @@ def _refract_through_drop(
     Args:
         direction: unit direction before the drop.
         dx, dy: where the ray enters, from the drop's center, millimetres.
-        drop: center, radius and curvature radius, as in `raindrops`.
+        drop: center, radius and curvature radius, as in `sample_raindrops`.
 
     Returns:
         The direction behind the drop, not normalised; the fraction of the light that
         passes; and whether the ray is lost by total reflection.
     """
-    inner = mi.Vector3f(direction.x / WATER, direction.y / WATER, 0.0)
+    inner = mi.Vector3f(direction.x / WATER_IOR, direction.y / WATER_IOR, 0.0)
     inner.z = dr.safe_sqrt(1.0 - inner.x * inner.x - inner.y * inner.y)
 
     # From the center of curvature: where the ray enters, and where it leaves.
@@ -441,11 +447,11 @@ def _refract_through_drop(
     normal = exit_point / drop.w
 
     cos_inside = dr.dot(inner, normal)
-    cos_outside_squared = 1.0 - WATER * WATER * (1.0 - cos_inside * cos_inside)
+    cos_outside_squared = 1.0 - WATER_IOR * WATER_IOR * (1.0 - cos_inside * cos_inside)
     cos_outside = dr.safe_sqrt(cos_outside_squared)
-    outer = WATER * inner + (cos_outside - WATER * cos_inside) * normal
-    transmitted = _transmittance(direction.z, inner.z, 1.0, WATER) * _transmittance(
-        cos_inside, cos_outside, WATER, 1.0
+    outer = WATER_IOR * inner + (cos_outside - WATER_IOR * cos_inside) * normal
+    transmitted = _transmittance(direction.z, inner.z, 1.0, WATER_IOR) * _transmittance(
+        cos_inside, cos_outside, WATER_IOR, 1.0
     )
     is_lost = (cos_outside_squared <= 0.0) | (outer.z <= 0.0)
     return outer, transmitted, is_lost
@@ -461,14 +467,14 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
 
     Raindrops before the camera bend the rays, see the comment at the top.
 
-    Parameters: `to_world`; `lens`, its numbers in the order of `NUMBERS`.
+    Parameters: `to_world`; `lens`, its numbers in the order of `NUMBER_NAMES`.
     """
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
-        values = tuple(float(props[name]) for name in NUMBERS)
+        values = tuple(float(props[name]) for name in NUMBER_NAMES)
         self._model = CameraModel(
-            str(props["kind"]), values, reach=float(props["reach"])
+            str(props["kind"]), values, max_angle=float(props["reach"])
         )
         self._near = float(props["near_clip"])
         self._far = float(props["far_clip"])
@@ -477,7 +483,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
             for size in self.film().crop_size()
         )
         self.pose = mi.Transform4f(super().world_transform())
-        self.lens = mi.TensorXf(list(values), (len(NUMBERS),))
+        self.lens = mi.TensorXf(list(values), (len(NUMBER_NAMES),))
         self._make_rays()
         self._half = 0.0  # width of the square with drops; 0 without drops
         if "drops" in props:
@@ -485,7 +491,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
 
     def _make_drops(self, props: Any) -> None:
         """Sample the raindrops that the sensor's properties describe."""
-        self._half, drops, grid = raindrops(
+        self._half, drops, grid = sample_raindrops(
             int(props["drops"]),
             float(props["drop_size"]),
             int(props["drop_seed"]),
@@ -559,8 +565,8 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
             The unit directions, and the fraction of the light that passes (1 without a
             drop, 0 where a drop reflects it inside).
         """
-        lens = APERTURE * mi.warp.square_to_uniform_disk_concentric(sample)
-        reach = DISTANCE / dr.maximum(direction.z, 1e-3)
+        lens = APERTURE_RADIUS * mi.warp.square_to_uniform_disk_concentric(sample)
+        reach = SHEET_DISTANCE / dr.maximum(direction.z, 1e-3)
         x = direction.x * reach + lens.x
         y = direction.y * reach + lens.y
         drop, dx, dy, is_hit = self._find_drop(x, y, direction.z > 0.1)
@@ -573,19 +579,23 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         """Find the drop at a point of the sheet, in millimetres.
 
         Returns:
-            The drop's four numbers, as in `raindrops`; the point's x and y from the
+            The drop's four numbers, as in `sample_raindrops`; the point's x and y from the
             drop's center; and whether there is a drop at all.
         """
         half_width = self._half
-        cells_per_mm = GRID / (2.0 * half_width)
+        cells_per_mm = GRID_SIZE / (2.0 * half_width)
         column = (x + half_width) * cells_per_mm
         row = (y + half_width) * cells_per_mm
         on_grid = (
-            active & (column >= 0.0) & (column < GRID) & (row >= 0.0) & (row < GRID)
+            active
+            & (column >= 0.0)
+            & (column < GRID_SIZE)
+            & (row >= 0.0)
+            & (row < GRID_SIZE)
         )
-        row_index = mi.UInt32(dr.clip(row, 0.0, GRID - 1.0))
-        column_index = mi.UInt32(dr.clip(column, 0.0, GRID - 1.0))
-        cell = row_index * GRID + column_index
+        row_index = mi.UInt32(dr.clip(row, 0.0, GRID_SIZE - 1.0))
+        column_index = mi.UInt32(dr.clip(column, 0.0, GRID_SIZE - 1.0))
+        cell = row_index * GRID_SIZE + column_index
         drop_index = dr.gather(mi.UInt32, self._drop_of_cell, cell, on_grid)
         drop = dr.gather(mi.Vector4f, self._drops, drop_index)
         dx = x - drop.x
@@ -601,7 +611,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         positions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
         with torch.no_grad():
             model = self._model.with_numbers(self.lens.torch().cpu())
-            table = model.table(positions.reshape(-1, 2))
+            table = model.make_ray_table(positions.reshape(-1, 2))
         self.rays = mi.Float(table.reshape(-1).contiguous())
         dr.eval(self.rays)
 

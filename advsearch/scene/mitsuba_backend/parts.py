@@ -16,18 +16,18 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.scene import parts
-from advsearch.scene.camera_model import NUMBERS
+from advsearch.scene.camera_model import NUMBER_NAMES
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.grounds import paved
+from advsearch.scene.grounds import is_paved
 from advsearch.scene.mitsuba_backend import meshes
 from advsearch.scene.mitsuba_backend.variant import (
     Plugin,
     dr,
-    fewer_warnings,
     mi,
     population,
+    suppress_warnings,
 )
 
 Write = Callable[[Any], Any]
@@ -36,37 +36,37 @@ Write = Callable[[Any], Any]
 Gradients may be enabled.
 """
 # a single number, or a vertex buffer, which Mitsuba takes flat
-number: Write = attrgetter("array")
+to_flat_array: Write = attrgetter("array")
 
 
-def plain_number(value: Any) -> float:
+def to_constant(value: Any) -> float:
     """Return a single number that is a constant of the kernel."""
     return float(value.array[0])
 
 
-def color(value: Any) -> Any:
+def to_color(value: Any) -> Any:
     """Convert three numbers to a Mitsuba color."""
-    return mi.Color3f(*_entries(value, 3))
+    return mi.Color3f(*_get_entries(value, 3))
 
 
-def point(value: Any) -> Any:
+def to_point(value: Any) -> Any:
     """Convert three numbers to a Mitsuba point."""
-    return mi.Point3f(*_entries(value, 3))
+    return mi.Point3f(*_get_entries(value, 3))
 
 
-def transform(value: Any) -> Any:
+def to_transform(value: Any) -> Any:
     """Convert a (4, 4) matrix to a Mitsuba transform."""
-    entries = _entries(value, 16)
+    entries = _get_entries(value, 16)
     return mi.Transform4f(
         mi.Matrix4f([entries[4 * row : 4 * row + 4] for row in range(4)])
     )
 
 
-def as_torch(value: Any) -> Tensor:
+def to_torch(value: Any) -> Tensor:
     """Convert a Dr.Jit value to a torch tensor with memory of its own."""
     # Dr.Jit's own conversion gives a color six entries
     if isinstance(value, (mi.Color3f, mi.Point3f)):
-        return torch.cat([as_torch(component) for component in value])
+        return torch.cat([to_torch(component) for component in value])
     value = getattr(value, "matrix", value)
     if hasattr(value, "torch"):
         tensor: Tensor = value.torch()
@@ -75,7 +75,7 @@ def as_torch(value: Any) -> Tensor:
     return tensor.clone()
 
 
-def _entries(value: Any, count: int) -> list[Any]:
+def _get_entries(value: Any, count: int) -> list[Any]:
     """Return the first entries of a Dr.Jit tensor, one array for each."""
     return [
         dr.gather(mi.Float, value.array, mi.UInt32(entry)) for entry in range(count)
@@ -92,22 +92,24 @@ class SceneInput:
     key: str
     # converts the tensor; None where Mitsuba takes it itself, as for textures and grids
     write: Write | None = None
-    interior: bool = False  # the interior adjoint (`prb`) differentiates it correctly
+    is_interior: bool = (
+        False  # the interior adjoint (`prb`) differentiates it correctly
+    )
     # of the tensor; None takes it from Mitsuba's own value
     shape: tuple[int, ...] | None = None
     # Mitsuba's object that has the parameter, where `key` alone may mean several
     owner: Any = None
     # the range that is rendered; a value beyond is clamped to it, and keeps its
     # derivative
-    within: tuple[float, float] | None = None
+    rendered_range: tuple[float, float] | None = None
 
-    def rendered(self, value: Tensor) -> Tensor:
+    def to_rendered(self, value: Tensor) -> Tensor:
         """Return what is set for a value: contiguous float32 within the range."""
         value = value.detach().to(torch.float32).contiguous()
-        return value.clamp(*self.within) if self.within else value
+        return value.clamp(*self.rendered_range) if self.rendered_range else value
 
 
-def key_of(parameters: Any, scene_input: SceneInput) -> str | None:
+def find_key(parameters: Any, scene_input: SceneInput) -> str | None:
     """Return the one parameter of Mitsuba that an input means; None without one."""
     prefix, star, suffix = scene_input.key.partition("*")
 
@@ -152,7 +154,7 @@ class Translation:
 
 
 @singledispatch
-def translation(part: parts.ScenePart) -> Translation:
+def translate_part(part: parts.ScenePart) -> Translation:
     """Return what a part is inside Mitsuba.
 
     Further kinds of parts are registered: `@translation.register`.
@@ -163,8 +165,8 @@ def translation(part: parts.ScenePart) -> Translation:
     )
 
 
-@translation.register
-def mesh_translation(part: parts.MeshPart, lobes: Plugin | None = None) -> Translation:
+@translate_part.register
+def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Translation:
     """Return what a mesh is inside Mitsuba.
 
     `lobes` are further entries of the principled plugin, such as `IDLE_LOBES`.
@@ -174,101 +176,103 @@ def mesh_translation(part: parts.MeshPart, lobes: Plugin | None = None) -> Trans
     vertices_key = f"{name}.{meshes.POSITIONS}"
     normals_key = f"{name}.{meshes.NORMALS}"
     inputs = [
-        SceneInput(f"{name}.vertices", vertices_key, number, shape=shape),
-        SceneInput(f"{name}.normals", normals_key, number, shape=shape),
+        SceneInput(f"{name}.vertices", vertices_key, to_flat_array, shape=shape),
+        SceneInput(f"{name}.normals", normals_key, to_flat_array, shape=shape),
     ]
     if part.surface is None:
-        surface = meshes.principled(part, lobes)
-        inputs += _principled_inputs(name)
+        surface = meshes.make_principled(part, lobes)
+        inputs += _make_principled_inputs(name)
     else:
 
         def fill(options: Mapping[str, object]) -> object:
             texture = mi.load_dict(
-                meshes.base_texture(part.base_color, options), optimize=False
+                meshes.make_base_texture(part.base_color, options), optimize=False
             )
             inputs.append(
                 SceneInput(
                     f"{name}.base_color",
                     f"{name}.*.data",
-                    interior=True,
+                    is_interior=True,
                     owner=texture,
                 )
             )
             return texture
 
-        surface = meshes.own_surface(part.surface, fill)
-    if meshes.textured_emission(part):
+        surface = meshes.fill_base_color(part.surface, fill)
+    if meshes.has_textured_emission(part):
         inputs.append(
             SceneInput(
-                f"{name}.radiance", f"{name}.emitter.radiance.data", interior=True
+                f"{name}.radiance", f"{name}.emitter.radiance.data", is_interior=True
             )
         )
     elif part.emission is not None:
-        inputs.append(_light(name, "radiance", "emitter.radiance"))
-    mesh = meshes.mitsuba_mesh(
-        name, part.mesh, part.to_world, surface, meshes.emitter(part)
+        inputs.append(_make_light_input(name, "radiance", "emitter.radiance"))
+    mesh = meshes.make_mitsuba_mesh(
+        name, part.mesh, part.to_world, surface, meshes.make_emitter(part)
     )
     return Translation({name: mesh}, tuple(inputs))
 
 
-def _principled_inputs(name: str) -> list[SceneInput]:
+def _make_principled_inputs(name: str) -> list[SceneInput]:
     """Return the inputs of a mesh's principled surface."""
     base_color = SceneInput(
-        f"{name}.base_color", f"{name}.*.base_color.data", interior=True
+        f"{name}.base_color", f"{name}.*.base_color.data", is_interior=True
     )
     return [base_color] + [
         SceneInput(
             f"{name}.{parameter}",
             f"{name}.*.{key}",
-            number,
-            interior=True,
+            to_flat_array,
+            is_interior=True,
             shape=(1,),
-            within=meshes.RENDERED.get(parameter),
+            rendered_range=meshes.RENDERED_RANGES.get(parameter),
         )
         for parameter, key in SURFACE_KEYS.items()
     ]
 
 
-def _light(name: str, parameter: str, key: str) -> SceneInput:
+def _make_light_input(name: str, parameter: str, key: str) -> SceneInput:
     """Return the input of a part's light, a color."""
-    return SceneInput(f"{name}.{parameter}", f"{name}.{key}.value", color, True, (3,))
-
-
-def _pose(name: str, parameter: str) -> SceneInput:
-    """Return the input of a part's pose."""
     return SceneInput(
-        f"{name}.{parameter}", f"{name}.to_world", transform, shape=(4, 4)
+        f"{name}.{parameter}", f"{name}.{key}.value", to_color, True, (3,)
     )
 
 
-@translation.register
-def _plugin(part: parts.PluginPart) -> Translation:
+def _make_pose_input(name: str, parameter: str) -> SceneInput:
+    """Return the input of a part's pose."""
+    return SceneInput(
+        f"{name}.{parameter}", f"{name}.to_world", to_transform, shape=(4, 4)
+    )
+
+
+@translate_part.register
+def _translate_plugin(part: parts.PluginPart) -> Translation:
     integrator = {"type": "prbvolpath"} if part.volumetric else {}
-    plugins = {part.name: meshes.loadable(part.plugin)}
+    plugins = {part.name: meshes.to_loadable(part.plugin)}
     return Translation(plugins, integrator=integrator)
 
 
-@translation.register
-def _numbers(part: parts.PluginNumbers) -> Translation:
+@translate_part.register
+def _translate_numbers(part: parts.PluginNumbers) -> Translation:
     return Translation(
         {},
         tuple(
-            _plugin_number_input(plugin_number)
+            _make_number_input(plugin_number)
             for plugin_number in part.numbers
             if plugin_number.input.startswith(f"{part.name}.")
         ),
     )
 
 
-def _plugin_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
+def _make_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
     """Return the input of a number or a color of a Mitsuba scene."""
     write: Write
     if plugin_number.plain:
-        write = plain_number
+        write = to_constant
     elif len(plugin_number.values) == 3:
-        write = color
+        write = to_color
     else:
-        write = number
+        write = to_flat_array
     surface_parameters = [
         parameter
         for parameter, key in SURFACE_KEYS.items()
@@ -276,59 +280,64 @@ def _plugin_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
     ]
     within = None
     if surface_parameters:
-        within = meshes.RENDERED.get(surface_parameters[0])
+        within = meshes.RENDERED_RANGES.get(surface_parameters[0])
     return SceneInput(
         plugin_number.input,
         plugin_number.key,
         write,
-        interior="adjoint" in plugin_number.valid,
+        is_interior="adjoint" in plugin_number.valid,
         shape=(len(plugin_number.values),),
-        within=within,
+        rendered_range=within,
     )
 
 
-@translation.register
-def _point(part: parts.PointLamp) -> Translation:
+@translate_part.register
+def _translate_point_lamp(part: parts.PointLamp) -> Translation:
     name = part.name
     lamp = {
         "type": "point",
         "position": list(part.position),
-        "intensity": _rgb(part.intensity),
+        "intensity": _make_rgb(part.intensity),
     }
-    position = SceneInput(f"{name}.position", f"{name}.position", point, shape=(3,))
-    return Translation({name: lamp}, (position, _light(name, "intensity", "intensity")))
+    position = SceneInput(f"{name}.position", f"{name}.position", to_point, shape=(3,))
+    return Translation(
+        {name: lamp}, (position, _make_light_input(name, "intensity", "intensity"))
+    )
 
 
-@translation.register
-def _spot(part: parts.SpotLamp) -> Translation:
+@translate_part.register
+def _translate_spot_lamp(part: parts.SpotLamp) -> Translation:
     cutoff, beam = part.cone
     lamp = {
         "type": "spot",
         "to_world": mi.ScalarTransform4f(part.to_world),
-        "intensity": _rgb(part.intensity),
+        "intensity": _make_rgb(part.intensity),
         "cutoff_angle": cutoff,
         "beam_width": beam,
     }
     return Translation(
-        {part.name: lamp}, (_light(part.name, "intensity", "intensity"),)
+        {part.name: lamp}, (_make_light_input(part.name, "intensity", "intensity"),)
     )
 
 
-@translation.register
-def _ball(part: parts.BallLamp) -> Translation:
-    pose = mi.ScalarTransform4f().translate(list(part.place)).scale(part.radius)
+@translate_part.register
+def _translate_ball_lamp(part: parts.BallLamp) -> Translation:
+    pose = mi.ScalarTransform4f().translate(list(part.center)).scale(part.radius)
     ball = {
         "type": "sphere",
         "to_world": pose,
         "bsdf": {"type": "null"},
-        "emitter": {"type": "area", "radiance": _rgb(part.radiance)},
+        "emitter": {"type": "area", "radiance": _make_rgb(part.radiance)},
     }
-    inputs = _pose(part.name, "ball"), _light(part.name, "radiance", "emitter.radiance")
+    inputs = (
+        _make_pose_input(part.name, "ball"),
+        _make_light_input(part.name, "radiance", "emitter.radiance"),
+    )
     return Translation({part.name: ball}, inputs)
 
 
-@translation.register
-def _projector(part: parts.ProjectorPart) -> Translation:
+@translate_part.register
+def _translate_projector(part: parts.ProjectorPart) -> Translation:
     """Return a projector.
 
     Mitsuba's texture times pi is the irradiance at distance 1, so that it is a white
@@ -347,12 +356,12 @@ def _projector(part: parts.ProjectorPart) -> Translation:
         "fov_axis": "x",
         "irradiance": image,
     }
-    pattern = SceneInput(f"{name}.pattern", f"{name}.irradiance.data", interior=True)
-    return Translation({name: projector}, (_pose(name, "pose"), pattern))
+    pattern = SceneInput(f"{name}.pattern", f"{name}.irradiance.data", is_interior=True)
+    return Translation({name: projector}, (_make_pose_input(name, "pose"), pattern))
 
 
-@translation.register
-def _beam(part: parts.BeamLamp) -> Translation:
+@translate_part.register
+def _translate_beam(part: parts.BeamLamp) -> Translation:
     """Return a headlamp's beam as a projector.
 
     Mitsuba's projector puts pi times its texture on a plane before it, where an
@@ -368,21 +377,21 @@ def _beam(part: parts.BeamLamp) -> Translation:
         "to_world": mi.ScalarTransform4f(part.to_world),
         "fov": 90.0,
         "fov_axis": "x",
-        "irradiance": {**meshes.texture(image), "wrap_mode": "clamp"},
+        "irradiance": {**meshes.make_texture(image), "wrap_mode": "clamp"},
         "sampling_weight": part.weight,
     }
-    return Translation({part.name: lamp}, (_pose(part.name, "to_world"),))
+    return Translation({part.name: lamp}, (_make_pose_input(part.name, "to_world"),))
 
 
-@translation.register
-def _haze(part: parts.HazePart) -> Translation:
+@translate_part.register
+def _translate_haze(part: parts.HazePart) -> Translation:
     """Return a haze.
 
     Mitsuba's medium only holds density and albedo for the integrator: no shape refers
     to it.
     """
     name = part.name
-    albedo = _rgb(part.albedo)
+    albedo = _make_rgb(part.albedo)
     medium = mi.load_dict(
         {"type": "homogeneous", "albedo": albedo, "sigma_t": part.density},
         optimize=False,
@@ -391,9 +400,11 @@ def _haze(part: parts.HazePart) -> Translation:
     population.add(population, media=(medium,))
     inputs = (
         SceneInput(
-            f"{name}.density", f"{name}.sigma_t.value.value", number, True, (1,)
+            f"{name}.density", f"{name}.sigma_t.value.value", to_flat_array, True, (1,)
         ),
-        SceneInput(f"{name}.albedo", f"{name}.albedo.value.value", color, True, (3,)),
+        SceneInput(
+            f"{name}.albedo", f"{name}.albedo.value.value", to_color, True, (3,)
+        ),
     )
     return Translation(
         {name: medium},
@@ -402,14 +413,14 @@ def _haze(part: parts.HazePart) -> Translation:
     )
 
 
-def _rgb(value: Sequence[float]) -> Plugin:
+def _make_rgb(value: Sequence[float]) -> Plugin:
     return {"type": "rgb", "value": list(value)}
 
 
-GROUND = "ground"
+GROUND_NAME = "ground"
 
 
-def scene_dict(
+def make_scene_dict(
     description: SceneDescription,
     resolution: tuple[int, int],
     filter: str,
@@ -422,7 +433,7 @@ def scene_dict(
     height, width = resolution
     to_world = camera_to_world(description, width / height)
     camera: Plugin = {
-        **_lens(description),
+        **_make_lens(description),
         "near_clip": 0.01,
         "far_clip": 1e5,
         "to_world": mi.ScalarTransform4f(to_world),
@@ -448,23 +459,25 @@ def scene_dict(
             .rotate([0, 0, 1], rotation)
             .rotate([1, 0, 0], 90),
         }
-    ground = _ground(description)
+    ground = _make_ground(description)
     if ground is not None:
-        scene[GROUND] = ground
+        scene[GROUND_NAME] = ground
     return scene
 
 
-def _ground(description: SceneDescription) -> Any:
+def _make_ground(description: SceneDescription) -> Any:
     """Return the ground: a photographed one, a plain one, or None."""
     photograph = description.photograph
     if photograph is not None:
-        surface = meshes.matt(photograph.base.numpy())
-        return meshes.mitsuba_mesh(GROUND, photograph.mesh, np.eye(4), surface)
+        surface = meshes.make_diffuse(photograph.base_color.numpy())
+        return meshes.make_mitsuba_mesh(
+            GROUND_NAME, photograph.mesh, np.eye(4), surface
+        )
     size = description.number("ground.size")
-    if not size > 0.0 or paved(description):
+    if not size > 0.0 or is_paved(description):
         return None
     srgb = np.array(description.ground_color, np.float32)
-    reflectance = _rgb(srgb_to_linear(srgb).tolist())
+    reflectance = _make_rgb(srgb_to_linear(srgb).tolist())
     return {
         "type": "rectangle",
         "to_world": mi.ScalarTransform4f().scale(size / 2.0),
@@ -476,7 +489,7 @@ def _ground(description: SceneDescription) -> Any:
 
 
 @contextlib.contextmanager
-def refusing(description: SceneDescription) -> Iterator[None]:
+def convert_refusals(description: SceneDescription) -> Iterator[None]:
     """Turn Mitsuba's errors about the user's plugins into input errors.
 
     The object's surface may be such a plugin. They are loaded inside the `with`.
@@ -490,7 +503,7 @@ def refusing(description: SceneDescription) -> Iterator[None]:
         isinstance(part, parts.PluginPart) for part in description.parts
     )
     try:
-        with fewer_warnings():
+        with suppress_warnings():
             yield
     except (RuntimeError, TypeError, ValueError) as error:
         if not has_user_surface and not has_user_plugins:
@@ -502,7 +515,7 @@ def refusing(description: SceneDescription) -> Iterator[None]:
         ) from error
 
 
-def _lens(description: SceneDescription) -> Plugin:
+def _make_lens(description: SceneDescription) -> Plugin:
     """Return the plugin of the camera's lens, without pose and film."""
     model = description.camera_model
     drops = description.number("camera.drops")
@@ -520,7 +533,7 @@ def _lens(description: SceneDescription) -> Plugin:
             "leave one of the two out"
         )
     # a searched lens may fold
-    if description.backdrop and (model.black > 0.0 or not model.name):
+    if description.backdrop and (model.black_fraction > 0.0 or not model.name):
         raise InputError(
             "background: it would show where the camera's lens sees nothing as well; "
             "leave the plain background out, "
@@ -529,7 +542,7 @@ def _lens(description: SceneDescription) -> Plugin:
     camera: Plugin = {
         "type": "advsearch_camera",
         "kind": model.kind,
-        "reach": model.reach,
+        "reach": model.max_angle,
         **model.values,
     }
     if drops > 0.0:
@@ -539,14 +552,14 @@ def _lens(description: SceneDescription) -> Plugin:
         }
         half_fov = math.radians(description.number("camera.fov")) / 2.0
         if model.name:
-            camera["drop_tangent"] = max(model.tangents)
+            camera["drop_tangent"] = max(model.visible_tangents)
         else:
             camera["drop_tangent"] = math.tan(half_fov)
     return camera
 
 
 # Mitsuba's names of numbers of the camera, by the names of our inputs
-CAMERA_NUMBERS = {
+CAMERA_KEYS = {
     "shift_x": "principal_point_offset_x",
     "shift_y": "principal_point_offset_y",
     "aperture": "aperture_radius",
@@ -554,7 +567,7 @@ CAMERA_NUMBERS = {
 }
 
 
-def scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
+def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
     """Return the inputs of camera, environment and ground.
 
     Our field of view is along the larger side of the image, Mitsuba's along the width.
@@ -567,18 +580,20 @@ def scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         return mi.Float(2.0 * dr.rad2deg(dr.atan(half_tangent)))
 
     camera_inputs = [
-        SceneInput(f"camera.{name}", f"camera.{key}", number, shape=(1,))
-        for name, key in CAMERA_NUMBERS.items()
+        SceneInput(f"camera.{name}", f"camera.{key}", to_flat_array, shape=(1,))
+        for name, key in CAMERA_KEYS.items()
     ]
     return (
-        _pose("camera", "to_world"),
+        _make_pose_input("camera", "to_world"),
         SceneInput("camera.fov", "camera.x_fov", to_horizontal_fov, shape=(1,)),
-        SceneInput("camera.lens", "camera.lens", shape=(len(NUMBERS),)),
+        SceneInput("camera.lens", "camera.lens", shape=(len(NUMBER_NAMES),)),
         *camera_inputs,
         # (H, W + 2, 3): a copy of the last column before the first, and of the first
         # after the last
-        SceneInput("environment.padded", "environment.data", interior=True),
+        SceneInput("environment.padded", "environment.data", is_interior=True),
         # (h, w, 3): of a ground that shows the environment's photograph
         # (`advsearch.scene.grounds`)
-        SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", interior=True),
+        SceneInput(
+            "ground.reflectance", f"{GROUND_NAME}.*.reflectance.data", is_interior=True
+        ),
     )

@@ -21,31 +21,40 @@ from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import EVERYTHING, SAMPLER, Surfaces, next_count
-from advsearch.scene.grounds import enclosed
+from advsearch.scene.formation import (
+    ALL_OMISSIONS,
+    SAMPLER,
+    Surfaces,
+    round_sample_count,
+)
+from advsearch.scene.grounds import is_enclosed
 from advsearch.scene.mitsuba_backend import parts
 from advsearch.scene.mitsuba_backend.meshes import (
     NORMALS,
     POSITIONS,
-    repeating,
-    sampling_weights,
-    textured_emission,
+    compute_sampling_weights,
+    has_textured_emission,
+    to_repeating_uv,
 )
-from advsearch.scene.mitsuba_backend.transport import Paths, collect, first_hits
+from advsearch.scene.mitsuba_backend.transport import (
+    Paths,
+    collect_paths,
+    find_first_hits,
+)
 from advsearch.scene.mitsuba_backend.variant import (
     Plugin,
     Recordings,
     dr,
     mi,
-    one_at_a_time,
+    mitsuba_lock,
     population,
 )
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_TYPE
-from advsearch.scene.parts import PATTERN, Lamp, LampGlass, plugins_in
+from advsearch.scene.parts import PATTERN_SUFFIX, Lamp, LampGlass, iterate_plugins
 
 MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
-NO_ROULETTE = 1000
-ROULETTE = 2
+NO_ROULETTE_DEPTH = 1000
+ROULETTE_DEPTH = 2
 """Segments after which Russian roulette starts.
 
 It never starts where paths soon leave the scene by themselves. Among houses it saves a
@@ -64,22 +73,22 @@ class MitsubaScene:
     Attributes:
         depth: current longest light path in segments.
         assembly: turns the inputs of a space into those of this scene.
-        made: the description, and the filter.
-        names: every input that can be set.
+        definition: the description, and the filter.
+        input_names: every input that can be set.
         parameters: Mitsuba's own.
-        roulette: segments of a light path after which Russian roulette starts.
-        declared: for each input its key in `parameters`, and its definition.
-        interior: the inputs that the interior adjoint differentiates correctly.
+        roulette_depth: segments of a light path after which Russian roulette starts.
+        declared_inputs: for each input its key in `parameters`, and its definition.
+        interior_inputs: the inputs that the interior adjoint differentiates correctly.
 
     Args:
         description: the scene.
         resolution: (height, width) in pixels.
         filter: reconstruction filter, "box" or "gaussian".
-        leave_out: names from `advsearch.scene.formation.ITEMS`; less than everything
+        leave_out: names from `advsearch.scene.formation.OMISSIONS`; less than everything
             only to measure what it saves.
         max_depth: longest light path in segments.
         sampler: Mitsuba's name of the sampler; some round sample counts up, see
-            `next_count`.
+            `round_sample_count`.
         integrator: Mitsuba's name of the path integrator of primal renders, where there
             is no medium.
     """
@@ -90,20 +99,20 @@ class MitsubaScene:
         resolution: tuple[int, int],
         *,
         filter: str = "box",
-        leave_out: Collection[str] = EVERYTHING,
+        leave_out: Collection[str] = ALL_OMISSIONS,
         max_depth: int = MAX_DEPTH,
         sampler: str = SAMPLER,
         integrator: str = "prb",
     ) -> None:
-        with one_at_a_time:
+        with mitsuba_lock:
             # it registers the plugins, which needs the variant
             import advsearch.scene.mitsuba_backend.own_plugins  # noqa: F401
 
             # First: kernels are compiled for the ids of their objects, which this
             # releases.
             if population.unused:
-                population.bury()
-            self.made = (description, filter)
+                population.free_unused()
+            self.definition = (description, filter)
             self.resolution = resolution
             self.sampler = sampler
             self.assembly = Assembly(description)
@@ -111,15 +120,17 @@ class MitsubaScene:
             self._leave_out = frozenset(leave_out)
             # Dr.Jit can record neither of these
             unrecorded = description.thin_lens or any(
-                map(textured_emission, description.meshes.values())
+                map(has_textured_emission, description.meshes.values())
             )
             self._freeze = "tracing" in leave_out and not unrecorded
-            self.roulette = ROULETTE if enclosed(description) else NO_ROULETTE
+            self.roulette_depth = (
+                ROULETTE_DEPTH if is_enclosed(description) else NO_ROULETTE_DEPTH
+            )
             self._pinhole = (
                 not description.thin_lens and description.camera_model is None
             )
             self._backdrop = description.backdrop
-            if description.backdrop and description.emits:
+            if description.backdrop and description.has_emission:
                 raise InputError(
                     "background: Mitsuba hides surfaces that emit light together with "
                     "the environment; leave the plain "
@@ -130,14 +141,16 @@ class MitsubaScene:
                 "type": "aov",
                 "aovs": "albedo:albedo,normal:sh_normal",
             }
-            if description.cut_out:
+            if description.has_opacity:
                 self._guides = {"type": "advsearch_guides"}
-            self.volumetric = any(part.volumetric for part in description.parts)
+            self.is_volumetric = any(part.volumetric for part in description.parts)
             self._path: Plugin = {"type": integrator}
             inputs = self._load_scene()
             self._sensor = self._scene.sensors()[0]
             self.parameters = mi.traverse(self._scene)
-            for name, weight in sampling_weights(description.meshes.values()).items():
+            for name, weight in compute_sampling_weights(
+                description.meshes.values()
+            ).items():
                 self.parameters[f"{name}.emitter.sampling_weight"] = weight
             self.parameters.update()
             self._integrators: dict[tuple[str, int], Any] = {}
@@ -154,17 +167,21 @@ class MitsubaScene:
             )
             self._every: dict[str, Tensor] = {}
             if "uploads" not in leave_out:
-                self._every = {name: self.base(name) for name in sorted(self.names)}
+                self._every = {
+                    name: self.get_base_value(name) for name in sorted(self.input_names)
+                }
 
     def _load_scene(self) -> list[parts.SceneInput]:
         """Load Mitsuba's scene, and return the inputs that it may have."""
-        description, filter = self.made
-        plugins = parts.scene_dict(description, self.resolution, filter, self.sampler)
-        with parts.refusing(description):
+        description, filter = self.definition
+        plugins = parts.make_scene_dict(
+            description, self.resolution, filter, self.sampler
+        )
+        with parts.convert_refusals(description):
             lobes = None if "lobes" in self._leave_out else parts.IDLE_LOBES
-            translations = [parts.mesh_translation(description.meshes[OBJECT], lobes)]
+            translations = [parts.translate_mesh(description.meshes[OBJECT], lobes)]
             translations += [
-                parts.translation(description.placed(part))
+                parts.translate_part(description.get_positioned_part(part))
                 for part in description.parts
             ]
             for translation in translations:
@@ -177,48 +194,48 @@ class MitsubaScene:
                         lamp = plugins[part.name]
                         lamp.get("emitter", lamp)["sampling_weight"] = 0.0
             self._scene = mi.load_dict(plugins, optimize=False)
-        inputs = list(parts.scene_inputs(self.resolution))
+        inputs = list(parts.make_scene_inputs(self.resolution))
         for translation in translations:
             inputs += translation.inputs
         return inputs
 
     def _declare_inputs(self, inputs: Sequence[parts.SceneInput]) -> None:
         """Set `declared`, `names` and `interior` by the inputs that the scene has."""
-        self.declared = dict[str, tuple[str, parts.SceneInput]]()
+        self.declared_inputs = dict[str, tuple[str, parts.SceneInput]]()
         for scene_input in inputs:
-            key = parts.key_of(self.parameters, scene_input)
+            key = parts.find_key(self.parameters, scene_input)
             if key:
-                self.declared[scene_input.name] = (key, scene_input)
-        self.names = frozenset(self.declared)
-        self.interior = frozenset(
+                self.declared_inputs[scene_input.name] = (key, scene_input)
+        self.input_names = frozenset(self.declared_inputs)
+        self.interior_inputs = frozenset(
             name
-            for name, (_, scene_input) in self.declared.items()
-            if scene_input.interior
+            for name, (_, scene_input) in self.declared_inputs.items()
+            if scene_input.is_interior
         )
         self._buffers = frozenset(
             name
-            for name, (key, _) in self.declared.items()
+            for name, (key, _) in self.declared_inputs.items()
             if key.endswith((POSITIONS, NORMALS))
         )
         self._literals = frozenset(
             name
-            for name, (_, scene_input) in self.declared.items()
-            if scene_input.write is parts.plain_number
+            for name, (_, scene_input) in self.declared_inputs.items()
+            if scene_input.write is parts.to_constant
         )
 
     def _find_media(self) -> tuple[Any, ...]:
         """Return the media inside and outside of all shapes."""
         media = []
-        for shape in self._scene.shapes() if self.volumetric else []:
+        for shape in self._scene.shapes() if self.is_volumetric else []:
             media += [shape.interior_medium(), shape.exterior_medium()]
         return tuple(medium for medium in media if medium is not None)
 
-    def like(self, **changes: Any) -> MitsubaScene:
+    def copy_with(self, **changes: Any) -> MitsubaScene:
         """Return another scene made with the same arguments but for some changes.
 
         What may change is `max_depth`, `sampler`, `integrator` and `leave_out`.
         """
-        description, filter = self.made
+        description, filter = self.definition
         settings = {
             "max_depth": self.max_depth,
             "leave_out": self._leave_out,
@@ -232,7 +249,7 @@ class MitsubaScene:
         return other
 
     @contextmanager
-    def shorter(self, depth: int | None) -> Iterator[None]:
+    def limit_depth(self, depth: int | None) -> Iterator[None]:
         """Limit light paths to `depth` segments inside the `with`, if it is not None."""
         depth_before = self.depth
         self.depth = self.depth if depth is None else min(depth, self.max_depth)
@@ -241,23 +258,23 @@ class MitsubaScene:
         finally:
             self.depth = depth_before
 
-    def next_count(self, samples: float, sampler: str | None = None) -> int:
+    def round_sample_count(self, samples: float, sampler: str | None = None) -> int:
         """Return how many samples the sampler takes when at least `samples` are needed.
 
         The scene's sampler is the default.
         """
-        return next_count(sampler or self.sampler, samples)
+        return round_sample_count(sampler or self.sampler, samples)
 
-    def base(self, name: str) -> Tensor:
+    def get_base_value(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh tensor of the input's shape."""
-        key, scene_input = self.declared[name]
+        key, scene_input = self.declared_inputs[name]
         self._set({})
-        value = parts.as_torch(self.parameters[key])
+        value = parts.to_torch(self.parameters[key])
         if scene_input.shape is None:
             return value
         return value.reshape(scene_input.shape)
 
-    def pictures(
+    def render_images(
         self, inputs: Mapping[str, Tensor], seeds: Mapping[str, int], spp: int
     ) -> list[Tensor]:
         """Render images of one configuration, each with independent samples.
@@ -279,7 +296,7 @@ class MitsubaScene:
             albedo in [0, 1] and its shading normal.
         """
         INTERRUPTS.look()
-        with one_at_a_time:
+        with mitsuba_lock:
 
             def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
                 image = integrator.render(
@@ -296,10 +313,10 @@ class MitsubaScene:
 
             self._set(inputs)
             if population.unused:
-                population.bury()
-            spp = self.next_count(spp)
+                population.free_unused()
+            spp = self.round_sample_count(spp)
             integrators = [self._integrator(method) for method in seeds]
-            media = population.media() if self.volumetric else []
+            media = population.list_media() if self.is_volumetric else []
             images: list[Tensor] = []
             for (method, seed), integrator in zip(
                 seeds.items(), integrators, strict=True
@@ -307,7 +324,7 @@ class MitsubaScene:
                 function: Callable[..., Any] = render
                 if self._freeze:
                     key = (method, spp, self.depth)
-                    function = self._recorded.of(key, render, media)
+                    function = self._recorded.get_or_record(key, render, media)
                 drjit_image = function(
                     self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)
                 )
@@ -318,11 +335,13 @@ class MitsubaScene:
                 images.append(image)
             return images
 
-    def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
+    def render_radiance(
+        self, inputs: Mapping[str, Tensor], seed: int, spp: int
+    ) -> Tensor:
         """Render linear radiance; arguments as for `pictures`."""
-        return self.pictures(inputs, {"path": seed}, spp)[0]
+        return self.render_images(inputs, {"path": seed}, spp)[0]
 
-    def guides(
+    def render_guides(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
     ) -> tuple[Tensor, Tensor]:
         """Render what guides the denoiser; arguments as for `pictures`.
@@ -330,16 +349,16 @@ class MitsubaScene:
         Returns:
             First-hit albedo and shading normal, each (H, W, 3) float32.
         """
-        guides = self.pictures(inputs, {"guides": seed}, spp)[0]
+        guides = self.render_images(inputs, {"guides": seed}, spp)[0]
         return guides[..., :3], guides[..., 3:]
 
-    def held(self, inputs: Mapping[str, Tensor]) -> Any:
+    def set_inputs(self, inputs: Mapping[str, Tensor]) -> Any:
         """Set inputs and return Mitsuba's scene, which has them until the next call."""
-        with one_at_a_time:
+        with mitsuba_lock:
             self._set(inputs)
             return self._scene
 
-    def stand(self, inputs: Mapping[str, Tensor]) -> None:
+    def set_geometry(self, inputs: Mapping[str, Tensor]) -> None:
         """Set the vertices and normals of these inputs, if others are set.
 
         All other inputs may then have any value.
@@ -352,28 +371,30 @@ class MitsubaScene:
             torch.equal(requested[name].float(), applied[name]) for name in requested
         )
         if not is_set:
-            self.held(inputs)
+            self.set_inputs(inputs)
 
-    def surfaces(self, inputs: Mapping[str, Tensor], fineness: int = 1) -> Surfaces:
+    def find_surfaces(
+        self, inputs: Mapping[str, Tensor], subdivision: int = 1
+    ) -> Surfaces:
         """Find what the camera sees first through the center of each pixel.
 
         Arguments as for `Renderer.surfaces`; lengths are object sizes.
         """
-        with one_at_a_time:
+        with mitsuba_lock:
             self._set(inputs)
             height, width = self.resolution
-            hits = first_hits(
-                self._scene, self._sensor, (height * fineness, width * fineness)
+            hits = find_first_hits(
+                self._scene, self._sensor, (height * subdivision, width * subdivision)
             )
-            for part in self.made[0].parts:
+            for part in self.definition[0].parts:
                 if isinstance(part, LampGlass):  # it counts as what carries it
-                    on_glass = hits.seen(part.name)
-                    carrier_face = torch.from_numpy(part.lies_on)
+                    on_glass = hits.visible_mask(part.name)
+                    carrier_face = torch.from_numpy(part.face_of_carrier)
                     hits.face[on_glass] = carrier_face[hits.face[on_glass]]
                     hits.id[on_glass] = hits.names.index(part.carrier) + 1
             return hits
 
-    def adjoint(
+    def render_adjoint(
         self,
         inputs: Mapping[str, Tensor],
         cotangent: Tensor,
@@ -401,12 +422,14 @@ class MitsubaScene:
         Returns:
             For each of `wrt` a float32 tensor of the input's shape.
         """
-        with one_at_a_time:
+        with mitsuba_lock:
             requested = tuple(inputs if wrt is None else wrt)
             # inputs that are differentiated although nobody asks for it
-            extra = set() if "gradients" in self._leave_out else set(self.interior)
+            extra = (
+                set() if "gradients" in self._leave_out else set(self.interior_inputs)
+            )
             # the projective integrator knows no lens and no medium
-            has_boundary = method == "path" and self._pinhole and not self.volumetric
+            has_boundary = method == "path" and self._pinhole and not self.is_volumetric
             if "boundary" not in self._leave_out and has_boundary:
                 method = "boundary"
                 extra = extra | self._buffers
@@ -423,7 +446,7 @@ class MitsubaScene:
                     mi.TensorXf(image_gradient),
                     sensor=self._sensor,
                     seed=seed,
-                    spp=self.next_count(spp),
+                    spp=self.round_sample_count(spp),
                 )
                 return {
                     name: dr.grad(tracked[name])
@@ -443,13 +466,13 @@ class MitsubaScene:
         level = mi.log_level()
         try:
             for name in names:
-                key, scene_input = self.declared[name]
+                key, scene_input = self.declared_inputs[name]
                 value = self.parameters[key]
                 old_values[key] = type(value)(value)
                 if name in inputs:
-                    tracked[name] = mi.TensorXf(scene_input.rendered(inputs[name]))
+                    tracked[name] = mi.TensorXf(scene_input.to_rendered(inputs[name]))
                 else:
-                    tracked[name] = mi.TensorXf(parts.as_torch(value))
+                    tracked[name] = mi.TensorXf(parts.to_torch(value))
                 dr.enable_grad(tracked[name])
                 if scene_input.write:
                     self.parameters[key] = scene_input.write(tracked[name])
@@ -465,7 +488,7 @@ class MitsubaScene:
                 self.parameters.__setitem__(*old_values.popitem())
             self.parameters.update()
 
-    def material_adjoint(
+    def render_material_adjoint(
         self,
         inputs: Mapping[str, Tensor],
         cotangent: Tensor,
@@ -480,7 +503,7 @@ class MitsubaScene:
         `NAME.normals` of each mesh, `spp` is the number of samples of the interior
         term; other arguments as for `adjoint`.
         """
-        with one_at_a_time:
+        with mitsuba_lock:
             # few scenes search a material
             from advsearch.scene.mitsuba_backend.material_adjoint import (
                 material_adjoint,
@@ -510,7 +533,7 @@ class MitsubaScene:
 
         return tuple(LIMITS)
 
-    def transport(
+    def collect_paths(
         self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int
     ) -> Paths:
         """Collect light paths for an input that is a base color or a projector's pattern.
@@ -518,20 +541,20 @@ class MitsubaScene:
         Their vertices have the change of their pixel for a unit more of the input, and
         the paths have an image. Other arguments as for `pictures`.
         """
-        with one_at_a_time:
+        with mitsuba_lock:
             self._set(inputs)
-            key = self.declared[name][0]
-            spp = self.next_count(spp)
+            key = self.declared_inputs[name][0]
+            spp = self.round_sample_count(spp)
             noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
             noise.set_samples_per_wavefront(spp)
             height, width = self.resolution
             noise.seed(dr.opaque(mi.UInt32, seed), height * width * spp)
             part = name.partition(".")[0]
             projector = None
-            if name.endswith(PATTERN):
+            if name.endswith(PATTERN_SUFFIX):
                 emitters = {emitter.id(): emitter for emitter in self._scene.emitters()}
                 projector = emitters.get(part)
-            paths = collect(
+            paths = collect_paths(
                 self._scene,
                 self.parameters,
                 key,
@@ -544,7 +567,7 @@ class MitsubaScene:
             size = self.parameters[key].shape[:2]
             surface = None
             if projector is None:
-                surface = self.made[0].meshes[part].surface
+                surface = self.definition[0].meshes[part].surface
                 if surface is None:
                     return paths
             vertices = [
@@ -579,7 +602,7 @@ class MitsubaScene:
 
     def _check_known(self, inputs: Mapping[str, Tensor]) -> None:
         """Check that the scene has all of these inputs."""
-        unknown = [name for name in inputs if name not in self.declared]
+        unknown = [name for name in inputs if name not in self.declared_inputs]
         if any(name.endswith(".base_color") for name in unknown):
             raise InputError(
                 f"{unknown[0]}: the surface is one of Mitsuba's own without a base "
@@ -590,7 +613,7 @@ class MitsubaScene:
         if unknown:
             raise InputError(
                 f"the scene has no input {', '.join(unknown)}; it has "
-                f"{', '.join(sorted(self.declared))}"
+                f"{', '.join(sorted(self.declared_inputs))}"
             )
 
     def _find_changes(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor | None]:
@@ -598,7 +621,7 @@ class MitsubaScene:
         reset = [name for name in self._applied if name not in inputs]
         changes: dict[str, Tensor | None] = dict.fromkeys(reset)
         for name, tensor in inputs.items():
-            value = self.declared[name][1].rendered(tensor)
+            value = self.declared_inputs[name][1].to_rendered(tensor)
             applied = self._applied.get(name)
             is_set = (
                 applied is not None
@@ -611,7 +634,7 @@ class MitsubaScene:
 
     def _write(self, name: str, fresh: Tensor | None) -> None:
         """Write a value, or None for the base value, to Mitsuba's parameter."""
-        key, scene_input = self.declared[name]
+        key, scene_input = self.declared_inputs[name]
         current = self.parameters[key]
         if fresh is not None and scene_input.shape is not None:
             if fresh.numel() != math.prod(scene_input.shape):
@@ -646,7 +669,7 @@ class MitsubaScene:
             path = {
                 "type": "prb",
                 "max_depth": self.depth,
-                "rr_depth": self.roulette,
+                "rr_depth": self.roulette_depth,
                 **self._path,
             }
             recipes: dict[str, Plugin] = {
@@ -656,7 +679,7 @@ class MitsubaScene:
                 "boundary": {
                     "type": "prb_projective",
                     "max_depth": self.depth,
-                    "rr_depth": NO_ROULETTE,
+                    "rr_depth": NO_ROULETTE_DEPTH,
                     "guiding": "none",
                 },
             }
@@ -677,6 +700,8 @@ def _to_repeating(
         half_texel = 0.5 / torch.tensor(size[::-1])
         return uv.clamp(half_texel, 1.0 - half_texel)
     options = next(
-        plugin for plugin in plugins_in(surface) if plugin["type"] == BASE_COLOR_TYPE
+        plugin
+        for plugin in iterate_plugins(surface)
+        if plugin["type"] == BASE_COLOR_TYPE
     )
-    return repeating(uv, options, size)
+    return to_repeating_uv(uv, options, size)

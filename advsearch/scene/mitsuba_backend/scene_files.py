@@ -16,37 +16,48 @@ from pathlib import Path
 import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import FileAxis, Floats, Mesh, ObjectAsset, normalised
-from advsearch.scene.importing.files import Notes, clean, safe_name, shown
-from advsearch.scene.importing.geometry import assemble, join
-from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
-from advsearch.scene.importing.scenes import TAKEN, ImportedScene
-from advsearch.scene.importing.texture import textured
+from advsearch.scene.assets import (
+    FileAxis,
+    Float32Array,
+    Mesh,
+    ObjectAsset,
+    normalise_mesh,
+)
+from advsearch.scene.importing.files import (
+    Notes,
+    format_name,
+    make_safe_name,
+    sanitize_name,
+)
+from advsearch.scene.importing.geometry import assemble, join_parts
+from advsearch.scene.importing.parts import MAX_RADIANCE, ImportedPart, ImportedSurface
+from advsearch.scene.importing.scenes import RESERVED_NAMES, ImportedScene
+from advsearch.scene.importing.texture import apply_textures
 from advsearch.scene.mitsuba_backend import shapes
-from advsearch.scene.mitsuba_backend.meshes import plain, with_inner
+from advsearch.scene.mitsuba_backend.meshes import map_inner_plugins, to_plain
 from advsearch.scene.mitsuba_backend.variant import Plugin
 from advsearch.scene.mitsuba_backend.xml_files import (
-    INTEGRATORS,
-    LIGHTS,
-    MEDIA,
-    SENSORS,
-    SHAPES,
+    INTEGRATOR_TYPES,
+    LIGHT_TYPES,
+    MEDIUM_TYPES,
+    SENSOR_TYPES,
+    SHAPE_TYPES,
+    check_and_read_files,
     read_scene,
-    trusted,
 )
 from advsearch.scene.parts import (
     MediumPart,
-    PlacedCamera,
     PluginPart,
+    PosedCamera,
     ScenePart,
-    plugins_in,
+    iterate_plugins,
 )
 
 CAMERAS = frozenset(("perspective", "thinlens"))
 PATH_INTEGRATORS = frozenset(
     ("path", "prb", "volpath", "prbvolpath", "volpathmis", "prb_projective")
 )
-NOTHING = {"type": "null"}  # the surface of what only bounds a medium
+NULL_BSDF = {"type": "null"}  # the surface of what only bounds a medium
 Y_TO_Z = np.array(
     [
         [1.0, 0.0, 0.0, 0.0],
@@ -55,10 +66,10 @@ Y_TO_Z = np.array(
         [0.0, 0.0, 0.0, 1.0],
     ]
 )
-MOST_PARTS = 2000  # plugins at the top of a scene
+MAX_PLUGINS = 2000  # plugins at the top of a scene
 # of the film to which Mitsuba's `focal_length` refers, millimetres
-DIAGONAL = math.hypot(36.0, 24.0)
-NUMBERS: Mapping[str, tuple[tuple[int, ...], str]] = {
+FILM_DIAGONAL = math.hypot(36.0, 24.0)
+NUMERIC_ENTRIES: Mapping[str, tuple[tuple[int, ...], str]] = {
     **dict.fromkeys(("radius", "fov", "width", "height"), ((), "a number")),
     **dict.fromkeys(
         ("center", "p0", "p1", "position", "direction"), ((3,), "three numbers")
@@ -68,21 +79,21 @@ NUMBERS: Mapping[str, tuple[tuple[int, ...], str]] = {
 """Entries that are numbers in whatever plugin has them: their shape and description."""
 
 
-def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
+def read_scene_dict(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
     """Read a scene file or a dictionary, with arrays for transforms.
 
     Returns:
         The dictionary, and warnings about its images.
 
     Raises:
-        FileFormatError: as for `read_scene` and `trusted`.
+        FileFormatError: as for `read_scene` and `check_and_read_files`.
         InputError: no scene.
     """
     notes: list[str] = []
     if isinstance(scene, Path):
-        tree = trusted(scene, read_scene(scene), notes)
+        tree = check_and_read_files(scene, read_scene(scene), notes)
     elif scene.get("type") == "scene":
-        tree = plain(scene)
+        tree = to_plain(scene)
         notes = [
             f"scene: {name} is left out: expected a plugin's dictionary, got "
             f"{type(entry).__name__}"
@@ -110,10 +121,10 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
         if isinstance(value, Mapping) and not is_color:
             inner_where = where
             if plugin["type"] == "scene":
-                inner_where = f"{where}: {shown(key, quoted=False)}"
+                inner_where = f"{where}: {format_name(key, quoted=False)}"
             _check_numbers(value, inner_where)
-        elif key in NUMBERS:
-            shape, expected = NUMBERS[key]
+        elif key in NUMERIC_ENTRIES:
+            shape, expected = NUMERIC_ENTRIES[key]
             try:
                 is_valid = np.asarray(value, np.float64).shape == shape
             except (TypeError, ValueError):
@@ -121,7 +132,7 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
             if not is_valid:
                 raise InputError(
                     f"{where}: expected {expected} as {key} of its {plugin['type']}, "
-                    f"got {shown(str(value))}"
+                    f"got {format_name(str(value))}"
                 )
 
 
@@ -130,23 +141,23 @@ class PluginContents:
     """What is in a Mitsuba scene, by id."""
 
     objects: tuple[str, ...]  # shapes that can be the object
-    kept: Mapping[str, str]  # the plugin's name of what stays as it is
+    unchanged: Mapping[str, str]  # the plugin's name of what stays as it is
     lights: tuple[str, ...]  # what emits light
     cameras: tuple[str, ...]  # sensors that can be used
 
 
-def contents(path: Path) -> PluginContents:
-    """Return what is understood of a scene file; errors as for `read_tree`."""
-    named = dict(_plugins(read_tree(path)[0]))
+def read_contents(path: Path) -> PluginContents:
+    """Return what is understood of a scene file; errors as for `read_scene_dict`."""
+    named = dict(_list_plugins(read_scene_dict(path)[0]))
     kinds = {name: str(plugin["type"]) for name, plugin in named.items()}
     objects = tuple(
         name
         for name, kind in kinds.items()
-        if kind in shapes.MESHES and named[name].get("bsdf") != NOTHING
+        if kind in shapes.OBJECT_SHAPES and named[name].get("bsdf") != NULL_BSDF
     )
     cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
     known = {*objects, *cameras}
-    replaced = INTEGRATORS | SENSORS
+    replaced = INTEGRATOR_TYPES | SENSOR_TYPES
     kept = {
         name: kind
         for name, kind in kinds.items()
@@ -157,15 +168,17 @@ def contents(path: Path) -> PluginContents:
 
 
 def _rename_reserved(name: str) -> str:
-    """Return a name that is not one of `TAKEN`."""
-    return f"{name}-2" if name in TAKEN else name
+    """Return a name that is not one of `RESERVED_NAMES`."""
+    return f"{name}-2" if name in RESERVED_NAMES else name
 
 
 def _emits_light(plugin: Mapping[str, object]) -> bool:
-    return any(inner.get("type") in LIGHTS for inner in plugins_in(plugin))
+    return any(inner.get("type") in LIGHT_TYPES for inner in iterate_plugins(plugin))
 
 
-def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedScene:
+def import_mitsuba_scene(
+    scene: Path | Mapping[str, object], object_id: str
+) -> ImportedScene:
     """Read a Mitsuba scene, an XML file or a dictionary as Mitsuba's loader takes it.
 
     The shape becomes a mesh with its own kind of surface, whose base color, where it
@@ -175,41 +188,43 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
 
     Args:
         scene: path of the file, or the dictionary.
-        wanted: id of the shape that is the object; where there is none, the only one
+        object_id: id of the shape that is the object; where there is none, the only one
             that differs in nothing but case and signs ("largebox" means "large-box", as
             Mitsuba's own writer calls it).
 
     Raises:
         UnknownNameError: it has no such shape.
-        FileFormatError: as for `read_tree`.
+        FileFormatError: as for `read_scene_dict`.
         InputError: the shape is no mesh and cannot be made one, or the scene is too
             large.
     """
-    tree, notes = read_tree(scene)
+    tree, notes = read_scene_dict(scene)
     where = scene.name if isinstance(scene, Path) else "scene"
-    named = dict(_plugins(tree))
-    wanted = _find_shape(named, wanted, where)
-    if len(named) > MOST_PARTS:
+    named = dict(_list_plugins(tree))
+    object_id = _find_shape(named, object_id, where)
+    if len(named) > MAX_PLUGINS:
         raise InputError(
-            f"{where}: expected at most {MOST_PARTS} plugins at the top, "
+            f"{where}: expected at most {MAX_PLUGINS} plugins at the top, "
             f"got {len(named)}; join meshes"
         )
-    shape = named[wanted]
-    surface = shapes.surface_of(_bsdf(shape, named))
-    mesh, has_uvs = shapes.mesh_of(shape, wanted)
-    frame = _ObjectFrame(mesh, wanted, z_up=_is_z_up(named))
-    haze, haze_names = shapes.haze_in(named, frame.matrix) or (None, frozenset[str]())
-    light = _light(shape)
-    left_out = _left_out(tree, shape, hazy=haze is not None, lit=light is not None)
-    missing = _missing_attributes(surface.plugin, mesh)
+    shape = named[object_id]
+    surface = shapes.read_surface(_find_surface(shape, named))
+    mesh, has_uvs = shapes.load_shape_mesh(shape, object_id)
+    frame = _ObjectFrame(mesh, object_id, z_up=_is_z_up(named))
+    haze, haze_names = shapes.find_haze(named, frame.matrix) or (None, frozenset[str]())
+    light = _find_radiance(shape)
+    left_out = _describe_left_out(
+        tree, shape, hazy=haze is not None, lit=light is not None
+    )
+    missing = _describe_missing_attributes(surface.plugin, mesh)
     notes += [f"{where}: {clause}" for clause in (*left_out, *surface.notes, *missing)]
     turn = frame.turn.astype(np.float32)
     mesh = replace(mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T)
     mesh, base_color = _paint(mesh, has_uvs, surface, str(shape["type"]), where)
     source = scene if isinstance(scene, Path) else Path("scene.xml")
     asset = ObjectAsset(
-        name=f"{safe_name(source)}-{clean(wanted)}",
-        mesh=normalised(mesh),
+        name=f"{make_safe_name(source)}-{sanitize_name(object_id)}",
+        mesh=normalise_mesh(mesh),
         base_color=base_color,
         source=str(source),
         warnings=tuple(notes),
@@ -219,7 +234,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
         extent=frame.size,
     )
     surroundings: list[ScenePart] = [] if haze is None else [haze]
-    surroundings += _import_surroundings(named, {wanted, *haze_names}, frame)
+    surroundings += _import_surroundings(named, {object_id, *haze_names}, frame)
     cameras = {
         _rename_reserved(name): _import_camera(plugin, frame)
         for name, plugin in named.items()
@@ -236,7 +251,7 @@ def _find_shape(
     def letters_of(name: str) -> str:
         return "".join(filter(str.isalnum, name.casefold()))
 
-    ids = [name for name, plugin in named.items() if plugin["type"] in SHAPES]
+    ids = [name for name, plugin in named.items() if plugin["type"] in SHAPE_TYPES]
     if wanted in ids:
         return wanted
     similar = [name for name in ids if letters_of(name) == letters_of(wanted)]
@@ -250,11 +265,11 @@ def _is_z_up(named: Mapping[str, Mapping[str, object]]) -> bool:
     posed_sensors = [
         plugin
         for plugin in named.values()
-        if plugin["type"] in SENSORS and "to_world" in plugin
+        if plugin["type"] in SENSOR_TYPES and "to_world" in plugin
     ]
     if not posed_sensors:
         return False
-    upwards = abs(shapes.pose_of(posed_sensors[0])[:3, 1])
+    upwards = abs(shapes.get_pose(posed_sensors[0])[:3, 1])
     return bool(upwards[2] > upwards[1])
 
 
@@ -264,19 +279,21 @@ def _import_surroundings(
     frame: _ObjectFrame,
 ) -> Iterator[ScenePart]:
     """Import all plugins that stay as they are; those that were `used` do not."""
-    replaced = INTEGRATORS | SENSORS
+    replaced = INTEGRATOR_TYPES | SENSOR_TYPES
     for name, plugin in named.items():
         if name in used or plugin["type"] in replaced:
             continue
-        moved = _rename_references(frame.moved(plugin))
-        has_medium = any(inner.get("type") in MEDIA for inner in plugins_in(moved))
+        moved = _rename_references(frame.move_plugin(plugin))
+        has_medium = any(
+            inner.get("type") in MEDIUM_TYPES for inner in iterate_plugins(moved)
+        )
         part_type = MediumPart if has_medium else PluginPart
         yield part_type(_rename_reserved(name), moved, _emits_light(moved))
 
 
 def _paint(
     mesh: Mesh, has_uvs: bool, surface: shapes.ShapeSurface, kind: str, where: str
-) -> tuple[Mesh, Floats]:
+) -> tuple[Mesh, Float32Array]:
     """Return a mesh with texture coordinates for its base color, and that base color.
 
     Where anything is looked up by the mesh's own coordinates, or by its attributes,
@@ -290,7 +307,7 @@ def _paint(
         kind: Mitsuba's type of the shape.
         where: the scene, for errors.
     """
-    if surface.picture or surface.bound:
+    if surface.is_textured or surface.is_bound:
         # the transform is that of coordinates with v downwards
         flipped = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
         flipped = flipped @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
@@ -306,11 +323,15 @@ def _paint(
         None,
         color,
     )
-    soup, maps = textured(join([part], where, np.eye(3)), [color], Notes(where))
+    soup, maps = apply_textures(
+        join_parts([part], where, np.eye(3)), [color], Notes(where)
+    )
     return assemble(soup)[0], maps.color
 
 
-def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, object]]]:
+def _list_plugins(
+    tree: Mapping[str, object],
+) -> Iterator[tuple[str, Mapping[str, object]]]:
     """Return the plugins at the top of a scene, by name."""
     return (
         (name, entry)
@@ -321,13 +342,13 @@ def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, obj
 
 def _rename_references(plugin: Mapping[str, object]) -> Plugin:
     """Return a plugin whose references have the names of `_rename_reserved`."""
-    entries = with_inner(plugin, _rename_references)
-    if entries["type"] == "ref" and entries["id"] in TAKEN:
+    entries = map_inner_plugins(plugin, _rename_references)
+    if entries["type"] == "ref" and entries["id"] in RESERVED_NAMES:
         entries["id"] = f"{entries['id']}-2"
     return entries
 
 
-def _bsdf(
+def _find_surface(
     shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]
 ) -> Mapping[str, object]:
     """Return the surface of a shape, with its references resolved.
@@ -339,9 +360,9 @@ def _bsdf(
     def resolve(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
         nonlocal count
         count += 1
-        if count > MOST_PARTS:
+        if count > MAX_PLUGINS:
             raise InputError(
-                f"object: expected a surface of at most {MOST_PARTS} "
+                f"object: expected a surface of at most {MAX_PLUGINS} "
                 "plugins, got more; make it simpler"
             )
         if plugin["type"] == "ref":
@@ -349,43 +370,48 @@ def _bsdf(
             if name not in named or depth > len(named):
                 raise UnknownNameError("material of the scene", name, list(named))
             return resolve(named[name], depth + 1)
-        return with_inner(plugin, lambda inner: resolve(inner, depth))
+        return map_inner_plugins(plugin, lambda inner: resolve(inner, depth))
 
     for entry in shape.values():
-        if isinstance(entry, Mapping) and entry["type"] not in LIGHTS | MEDIA:
+        if (
+            isinstance(entry, Mapping)
+            and entry["type"] not in LIGHT_TYPES | MEDIUM_TYPES
+        ):
             return resolve(entry, 0)
     return {"type": "diffuse"}
 
 
-def _light(shape: Mapping[str, object]) -> Floats | None:
+def _find_radiance(shape: Mapping[str, object]) -> Float32Array | None:
     """Return the radiance (1, 1, 3) of a shape that emits evenly; None of any other."""
     for inner in shape.values():
         if not isinstance(inner, Mapping) or inner["type"] != "area":
             continue
         if set(inner) <= {"type", "id", "radiance"}:
-            radiance = shapes.constant(inner.get("radiance"))
+            radiance = shapes.parse_constant_color(inner.get("radiance"))
             if (
                 radiance is not None
-                and 0.0 < radiance.max() <= BRIGHTEST
+                and 0.0 < radiance.max() <= MAX_RADIANCE
                 and radiance.min() >= 0.0
             ):
                 return radiance.reshape(1, 1, 3)
     return None
 
 
-def _missing_attributes(surface: Mapping[str, object], mesh: Mesh) -> Iterator[str]:
+def _describe_missing_attributes(
+    surface: Mapping[str, object], mesh: Mesh
+) -> Iterator[str]:
     """Yield clauses about attributes that a surface uses and the mesh has not."""
-    for plugin in plugins_in(surface):
+    for plugin in iterate_plugins(surface):
         name = plugin.get("name")
         if plugin["type"] == "mesh_attribute" and name not in mesh.attributes:
             available = ", ".join(sorted(mesh.attributes)) or "none"
             yield (
-                f"the mesh has no attribute {shown(str(name))} (it has {available}), "
+                f"the mesh has no attribute {format_name(str(name))} (it has {available}), "
                 "so that is black"
             )
 
 
-def _left_out(
+def _describe_left_out(
     tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool, lit: bool
 ) -> Iterator[str]:
     """Yield clauses about what is not as it is in the file.
@@ -396,25 +422,25 @@ def _left_out(
         hazy: the camera's medium is the scene's haze.
         lit: the object keeps its light.
     """
-    for name, plugin in _plugins(tree):
-        if plugin["type"] in INTEGRATORS:
-            yield from _left_out_of_integrator(name, plugin)
-        elif plugin["type"] in SENSORS:
-            yield from _left_out_of_sensor(name, plugin, hazy=hazy)
+    for name, plugin in _list_plugins(tree):
+        if plugin["type"] in INTEGRATOR_TYPES:
+            yield from _describe_integrator(name, plugin)
+        elif plugin["type"] in SENSOR_TYPES:
+            yield from _describe_sensor(name, plugin, hazy=hazy)
     for key, inner in shape.items():
         if not isinstance(inner, Mapping):
-            if key not in shapes.OF_A_SHAPE:
+            if key not in shapes.SHAPE_ENTRIES:
                 yield (
-                    f"the object's {shown(key)} is left out: a {shape['type']} has none"
+                    f"the object's {format_name(key)} is left out: a {shape['type']} has none"
                 )
             continue
-        if inner["type"] in LIGHTS and not lit:
+        if inner["type"] in LIGHT_TYPES and not lit:
             yield "the object's own light is left out"
-        if inner["type"] in MEDIA:
+        if inner["type"] in MEDIUM_TYPES:
             yield "the medium in the object is left out"
 
 
-def _left_out_of_integrator(name: str, plugin: Mapping[str, object]) -> Iterator[str]:
+def _describe_integrator(name: str, plugin: Mapping[str, object]) -> Iterator[str]:
     """Yield clauses about an integrator."""
     kind = plugin["type"]
     if kind not in PATH_INTEGRATORS:
@@ -433,7 +459,7 @@ def _left_out_of_integrator(name: str, plugin: Mapping[str, object]) -> Iterator
         )
 
 
-def _left_out_of_sensor(
+def _describe_sensor(
     name: str, plugin: Mapping[str, object], *, hazy: bool
 ) -> Iterator[str]:
     """Yield clauses about a sensor."""
@@ -481,25 +507,27 @@ class _ObjectFrame:
         )
         self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ move @ turn
 
-    def moved(self, plugin: Mapping[str, object], *, top: bool = True) -> Plugin:
+    def move_plugin(
+        self, plugin: Mapping[str, object], *, at_top: bool = True
+    ) -> Plugin:
         """Return a plugin of the scene in the object's coordinates.
 
         Args:
             plugin: its dictionary.
-            top: it stands at the top of the scene; within another plugin only media and
+            at_top: it stands at the top of the scene; within another plugin only media and
                 volumes change.
         """
         kind = plugin["type"]
-        if kind in MEDIA:
+        if kind in MEDIUM_TYPES:
             scale = float(np.asarray(plugin.get("scale", 1.0)))
             entries = {**plugin, "scale": scale * self.size}
         elif kind in ("gridvolume", "constvolume"):
             entries = self._with_pose(plugin)
-        elif not top:
+        elif not at_top:
             entries = dict(plugin)
         elif kind == "merge":
-            return with_inner(plugin, self.moved)
-        elif kind in SHAPES - {"shapegroup"}:
+            return map_inner_plugins(plugin, self.move_plugin)
+        elif kind in SHAPE_TYPES - {"shapegroup"}:
             entries = self._with_pose(plugin)
         elif kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
             entries = self._move_distant_light(plugin)
@@ -507,10 +535,12 @@ class _ObjectFrame:
             entries = self._move_lamp(plugin)
         else:
             entries = dict(plugin)
-        return with_inner(entries, lambda inner: self.moved(inner, top=False))
+        return map_inner_plugins(
+            entries, lambda inner: self.move_plugin(inner, at_top=False)
+        )
 
     def _with_pose(self, plugin: Mapping[str, object]) -> Plugin:
-        return {**plugin, "to_world": self.matrix @ shapes.pose_of(plugin)}
+        return {**plugin, "to_world": self.matrix @ shapes.get_pose(plugin)}
 
     def _move_distant_light(self, plugin: Mapping[str, object]) -> Plugin:
         """Rotate a light that is infinitely far."""
@@ -521,7 +551,7 @@ class _ObjectFrame:
         elif plugin["type"] != "constant":
             turn = np.eye(4)
             turn[:3, :3] = self.turn
-            entries["to_world"] = turn @ shapes.pose_of(plugin)
+            entries["to_world"] = turn @ shapes.get_pose(plugin)
         return entries
 
     def _move_lamp(self, plugin: Mapping[str, object]) -> Plugin:
@@ -575,9 +605,9 @@ def _scale_spectrum(value: Mapping[str, object], factor: float) -> Plugin | None
     return None
 
 
-def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PlacedCamera:
+def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCamera:
     """Return a sensor's pose and field of view along the larger side."""
-    matrix = frame.matrix @ shapes.pose_of(sensor)
+    matrix = frame.matrix @ shapes.get_pose(sensor)
     matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
     entries = [entry for entry in sensor.values() if isinstance(entry, Mapping)]
     film = next((plugin for plugin in entries if "film" in str(plugin["type"])), {})
@@ -603,7 +633,7 @@ def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PlacedC
     }
     length = lengths.get(axis, width)
     half_tangent = math.tan(math.radians(degrees) / 2.0) * larger / length
-    return PlacedCamera(matrix, 2.0 * math.degrees(math.atan(half_tangent)))
+    return PosedCamera(matrix, 2.0 * math.degrees(math.atan(half_tangent)))
 
 
 def _fov_of_focal_length(text: str) -> float:
@@ -615,4 +645,4 @@ def _fov_of_focal_length(text: str) -> float:
         raise InputError(
             f"focal_length: expected millimetres, such as 50mm, got {text!r}"
         )
-    return 2.0 * math.degrees(math.atan(DIAGONAL / (2.0 * length)))
+    return 2.0 * math.degrees(math.atan(FILM_DIAGONAL / (2.0 * length)))

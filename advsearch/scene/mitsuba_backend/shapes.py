@@ -9,32 +9,44 @@ from typing import NamedTuple
 import numpy as np
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Doubles, Floats, Ints, Mesh, face_vectors
+from advsearch.scene.assets import (
+    Float32Array,
+    Float64Array,
+    IntArray,
+    Mesh,
+    compute_area_vectors,
+)
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.mitsuba_backend.meshes import (
     FACES,
     NORMALS,
     POSITIONS,
     TEXCOORDS,
-    loadable,
-    with_inner,
+    map_inner_plugins,
+    to_loadable,
 )
-from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, mi
-from advsearch.scene.parts import BASE_COLOR, HazePart, plugins_in
+from advsearch.scene.mitsuba_backend.variant import Plugin, mi, suppress_warnings
+from advsearch.scene.parts import BASE_COLOR, HazePart, iterate_plugins
 
-Buffers = tuple[Doubles, Ints, Doubles | None, Doubles | None, dict[str, Floats]]
+Buffers = tuple[
+    Float64Array,
+    IntArray,
+    Float64Array | None,
+    Float64Array | None,
+    dict[str, Float32Array],
+]
 """Vertices, faces, normals and texture coordinates of a mesh, and its attributes.
 
 The attributes are (V or F, n), by their names.
 """
 # texture coordinates of a face that has none, as in Mitsuba
-BARE = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
-SECTIONS = 64  # segments around a round shape
+DEFAULT_FACE_UVS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+ROUND_SEGMENTS = 64  # segments around a round shape
 # shapes for which Mitsuba has no triangles
-SOLIDS = ("rectangle", "sphere", "cylinder", "disk")
+TESSELLATED_SHAPES = ("rectangle", "sphere", "cylinder", "disk")
 # the shapes that can be the object
-MESHES = (*SOLIDS, "cube", "obj", "ply", "serialized")
-OF_A_MESH = frozenset(  # entries of a mesh that are no surface, light or medium
+OBJECT_SHAPES = (*TESSELLATED_SHAPES, "cube", "obj", "ply", "serialized")
+MESH_ENTRIES = frozenset(  # entries of a mesh that are no surface, light or medium
     (
         "type",
         "filename",
@@ -45,7 +57,7 @@ OF_A_MESH = frozenset(  # entries of a mesh that are no surface, light or medium
         "shape_index",
     )
 )
-OF_A_SHAPE = OF_A_MESH | {
+SHAPE_ENTRIES = MESH_ENTRIES | {
     "id",
     "radius",
     "center",
@@ -57,7 +69,7 @@ OF_A_SHAPE = OF_A_MESH | {
 """The same for any shape."""
 
 
-def mesh_of(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]:
+def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]:
     """Return the triangles of a shape in a Mitsuba scene.
 
     Where Mitsuba has a mesh, it is Mitsuba's own; round shapes become triangles here.
@@ -71,18 +83,18 @@ def mesh_of(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]:
     Returns:
         The mesh, with its attributes and the file's texture coordinates, which may
         leave the unit square; and whether the file has such coordinates: otherwise they
-        are `BARE` on each face.
+        are `DEFAULT_FACE_UVS` on each face.
 
     Raises:
         InputError: the shape has no triangles, or vertices that are not finite.
     """
     kind = str(shape["type"])
-    if kind not in MESHES:
+    if kind not in OBJECT_SHAPES:
         raise InputError(
             f"object {name}: a {kind} cannot be moved; expected a shape "
-            f"of {', '.join(MESHES)}"
+            f"of {', '.join(OBJECT_SHAPES)}"
         )
-    if kind in SOLIDS:
+    if kind in TESSELLATED_SHAPES:
         buffers = _tessellate(kind, shape, name)
     else:
         buffers = _load_buffers(shape, name)
@@ -100,12 +112,16 @@ def mesh_of(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]:
         attributes = _select_vertices(attributes, corners)
         vertices = vertices[corners]
         faces = np.arange(len(corners)).reshape(-1, 3)
-        face_normals = _normalize(face_vectors(vertices[faces])).repeat(3, axis=0)
+        face_normals = _normalize(compute_area_vectors(vertices[faces])).repeat(
+            3, axis=0
+        )
         if is_flat or normals is None:
             normals = face_normals
         else:
             normals = normals[corners]
-        uvs = np.tile(BARE, (len(faces), 1)) if uvs is None else uvs[corners]
+        uvs = (
+            np.tile(DEFAULT_FACE_UVS, (len(faces), 1)) if uvs is None else uvs[corners]
+        )
 
     used, index = np.unique(faces, return_inverse=True)
     faces = index.reshape(-1, 3)
@@ -113,7 +129,10 @@ def mesh_of(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]:
     uvs = uvs[used] * (1.0, -1.0) + (0.0, 1.0)
     sign = -1.0 if shape.get("flip_normals") else 1.0
     normals = np.nan_to_num(normals)[used] * sign
-    if np.einsum("fk,fck->", face_vectors(vertices[faces]), normals[faces]) < 0.0:
+    if (
+        np.einsum("fk,fck->", compute_area_vectors(vertices[faces]), normals[faces])
+        < 0.0
+    ):
         # Mitsuba shades by the normals, in whatever order the corners of faces are
         faces = faces[:, ::-1]
     mesh = Mesh(
@@ -127,8 +146,8 @@ def mesh_of(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]:
 
 
 def _select_vertices(
-    attributes: Mapping[str, Floats], index: Ints
-) -> dict[str, Floats]:
+    attributes: Mapping[str, Float32Array], index: IntArray
+) -> dict[str, Float32Array]:
     """Return attributes in which those of vertices are selected by an index."""
     return {
         key: values[index] if key.startswith("vertex_") else values
@@ -138,17 +157,17 @@ def _select_vertices(
 
 def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
     """Load a mesh with Mitsuba; `name` is that of the object, for errors."""
-    entries = {key: value for key, value in shape.items() if key in OF_A_MESH}
+    entries = {key: value for key, value in shape.items() if key in MESH_ENTRIES}
     try:
-        with fewer_warnings():
-            mesh = mi.load_dict(loadable(entries))
+        with suppress_warnings():
+            mesh = mi.load_dict(to_loadable(entries))
     except RuntimeError as error:
         raise InputError(
             f"object {name}: Mitsuba refuses the shape: {error}; change it there"
         ) from error
     parameters = mi.traverse(mesh)
 
-    def get_rows(key: str, width: int) -> Doubles:
+    def get_rows(key: str, width: int) -> Float64Array:
         return np.array(parameters[key], np.float64).reshape(-1, width)
 
     vertices = get_rows(POSITIONS, 3)
@@ -159,7 +178,7 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
         )
     normals = get_rows(NORMALS, 3) if mesh.has_vertex_normals() else None
     uvs = get_rows(TEXCOORDS, 2) if mesh.has_vertex_texcoords() else None
-    attributes: dict[str, Floats] = {}
+    attributes: dict[str, Float32Array] = {}
     counts = {"vertex": len(vertices), "face": len(faces)}
     for key in parameters.keys():
         count = counts.get(key.split("_")[0], 0)
@@ -170,43 +189,43 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
     return vertices, faces, normals, uvs, attributes
 
 
-def _normalize(vectors: Doubles) -> Doubles:
+def _normalize(vectors: Float64Array) -> Float64Array:
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors / np.maximum(lengths, 1e-30))
 
 
 def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
-    """Make the triangles of one of `SOLIDS`, with Mitsuba's texture coordinates."""
+    """Make the triangles of one of `TESSELLATED_SHAPES`, with Mitsuba's texture coordinates."""
     local = np.eye(4)
-    turn = np.linspace(0.0, 1.0, SECTIONS + 1)
+    turn = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)
     normals = None
     if kind == "sphere":
-        uvs, faces = _grid(turn, turn[::2])
+        uvs, faces = _make_grid(turn, turn[::2])
         polar = np.pi * uvs[:, 1]
         vertices = np.stack(
-            [*(np.sin(polar) * _circle(uvs[:, 0])), np.cos(polar)], axis=1
+            [*(np.sin(polar) * _circle_points(uvs[:, 0])), np.cos(polar)], axis=1
         )
         normals = vertices
-        local[:3, :3] *= _radius_of(shape)
+        local[:3, :3] *= _get_radius(shape)
         local[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
     elif kind == "cylinder":  # open at both ends, as Mitsuba's
-        uvs, faces = _grid(turn, np.array([0.0, 1.0]))
-        vertices = np.stack([*_circle(uvs[:, 0]), uvs[:, 1]], axis=1)
+        uvs, faces = _make_grid(turn, np.array([0.0, 1.0]))
+        vertices = np.stack([*_circle_points(uvs[:, 0]), uvs[:, 1]], axis=1)
         normals = vertices * (1.0, 1.0, 0.0)
-        local = _cylinder_pose(shape)
+        local = _compute_cylinder_pose(shape)
     elif kind == "disk":
-        uvs, faces = _grid(turn[::8], turn)
+        uvs, faces = _make_grid(turn[::8], turn)
         vertices = np.stack(
-            [*(uvs[:, 0] * _circle(uvs[:, 1])), np.zeros(len(uvs))], axis=1
+            [*(uvs[:, 0] * _circle_points(uvs[:, 1])), np.zeros(len(uvs))], axis=1
         )
     else:
-        uvs, faces = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+        uvs, faces = _make_grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
         vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
     if normals is None:
         normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1))
     # without faces that have no area, such as those at a pole
-    faces = faces[np.linalg.norm(face_vectors(vertices[faces]), axis=1) > 1e-9]
-    matrix = pose_of(shape) @ local
+    faces = faces[np.linalg.norm(compute_area_vectors(vertices[faces]), axis=1) > 1e-9]
+    matrix = get_pose(shape) @ local
     if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
         raise InputError(
             f"object {name}: expected a {kind} of some size, got one "
@@ -216,15 +235,15 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, normals, uvs, {}
 
 
-def _radius_of(shape: Mapping[str, object]) -> float:
+def _get_radius(shape: Mapping[str, object]) -> float:
     return float(np.asarray(shape.get("radius", 1.0), np.float64))
 
 
-def _cylinder_pose(shape: Mapping[str, object]) -> Doubles:
+def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
     """Return the (4, 4) pose of the unit cylinder along z that is a given cylinder."""
     start = np.asarray(shape.get("p0", (0.0, 0.0, 0.0)), np.float64)
     end = np.asarray(shape.get("p1", (0.0, 0.0, 1.0)), np.float64)
-    radius = _radius_of(shape)
+    radius = _get_radius(shape)
     length = float(np.linalg.norm(end - start))
     axis = (end - start) / max(length, 1e-30)
     x, y, z = axis
@@ -239,7 +258,7 @@ def _cylinder_pose(shape: Mapping[str, object]) -> Doubles:
     return pose
 
 
-def _grid(u: Doubles, v: Doubles) -> tuple[Doubles, Ints]:
+def _make_grid(u: Float64Array, v: Float64Array) -> tuple[Float64Array, IntArray]:
     """Return the points (n, 2) of a grid and its triangles (m, 3)."""
     points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     row_starts = np.arange(len(v) - 1)[:, None] * len(u)
@@ -250,26 +269,28 @@ def _grid(u: Doubles, v: Doubles) -> tuple[Doubles, Ints]:
     return points, np.concatenate([lower, upper])
 
 
-def _circle(turn: Doubles) -> Doubles:
+def _circle_points(turn: Float64Array) -> Float64Array:
     """Return x and y on the unit circle, for fractions of a turn."""
     return np.asarray([np.cos(2.0 * np.pi * turn), np.sin(2.0 * np.pi * turn)])
 
 
-def pose_of(plugin: Mapping[str, object]) -> Doubles:
+def get_pose(plugin: Mapping[str, object]) -> Float64Array:
     """Return the pose (4, 4) of a plugin."""
     return np.asarray(plugin.get("to_world", np.eye(4)), dtype=np.float64)
 
 
 Plugins = Mapping[str, Mapping[str, object]]
-MOST = 2.0  # largest extinction of a haze per object size
-DARKEST = 1e-3  # smallest albedo of a haze
+MAX_EXTINCTION = 2.0  # largest extinction of a haze per object size
+MIN_ALBEDO = 1e-3  # smallest albedo of a haze
 # largest distance of the ball's center from the object's, in radii; its edge is far off
-OFF = 0.05
+MAX_CENTER_OFFSET = 0.05
 _OF_BALL = {"type", "id", "radius", "center", "to_world", "bsdf", "interior"}
 _OF_MEDIUM = {"type", "id", "sigma_t", "albedo", "scale", "phase"}
 
 
-def haze_in(named: Plugins, matrix: Doubles) -> tuple[HazePart, frozenset[str]] | None:
+def find_haze(
+    named: Plugins, matrix: Float64Array
+) -> tuple[HazePart, frozenset[str]] | None:
     """Find the haze of a scene.
 
     It is one grey medium in a ball that the camera stands in: Mitsuba's `prbvolpath`
@@ -290,22 +311,24 @@ def haze_in(named: Plugins, matrix: Doubles) -> tuple[HazePart, frozenset[str]] 
     ball_name, medium_name = names
     ball = named[ball_name]
     medium = named[medium_name]
-    pose = matrix @ pose_of(ball)
+    pose = matrix @ get_pose(ball)
     center = pose @ np.append(
-        np.broadcast_to(_numbers(ball.get("center", np.zeros(3))), (3,)), 1.0
+        np.broadcast_to(_parse_numbers(ball.get("center", np.zeros(3))), (3,)), 1.0
     )
-    scene_radius = float(_numbers(ball.get("radius", 1.0))[0])
+    scene_radius = float(_parse_numbers(ball.get("radius", 1.0))[0])
     radius = scene_radius * float(np.cbrt(abs(np.linalg.det(pose[:3, :3]))))
-    if not (radius > 0.0 and float(np.linalg.norm(center[:3])) <= OFF * radius):
+    if not (
+        radius > 0.0 and float(np.linalg.norm(center[:3])) <= MAX_CENTER_OFFSET * radius
+    ):
         return None
 
-    density = _numbers(medium.get("sigma_t", 1.0))
-    scale = _numbers(medium.get("scale", 1.0))
+    density = _parse_numbers(medium.get("sigma_t", 1.0))
+    scale = _parse_numbers(medium.get("scale", 1.0))
     object_size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     extinction = density * scale / object_size
-    is_grey = 0.0 < float(extinction.min()) == float(extinction.max()) <= MOST
-    albedo = np.broadcast_to(_numbers(medium.get("albedo", 0.75)), (3,)).tolist()
-    if not (is_grey and DARKEST <= min(albedo) and max(albedo) <= 1.0):
+    is_grey = 0.0 < float(extinction.min()) == float(extinction.max()) <= MAX_EXTINCTION
+    albedo = np.broadcast_to(_parse_numbers(medium.get("albedo", 0.75)), (3,)).tolist()
+    if not (is_grey and MIN_ALBEDO <= min(albedo) and max(albedo) <= 1.0):
         return None
     red, green, blue = albedo
     haze = HazePart(ball_name, radius, float(extinction[0]), (red, green, blue))
@@ -318,13 +341,13 @@ def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
     The only medium of the scene is homogeneous and isotropic, cameras stand in it, and
     a single sphere with no surface is filled with it.
     """
-    camera_media = {_reference(plugin.get("medium")) for plugin in named.values()}
+    camera_media = {_get_reference(plugin.get("medium")) for plugin in named.values()}
     camera_media.discard(None)
     balls = [
         name
         for name, plugin in named.items()
         if plugin["type"] == "sphere"
-        and _reference(plugin.get("interior")) in camera_media
+        and _get_reference(plugin.get("interior")) in camera_media
     ]
     media = [
         name
@@ -347,14 +370,14 @@ def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
     return (balls[0], media[0]) if is_haze else None
 
 
-def _reference(plugin: object) -> str | None:
+def _get_reference(plugin: object) -> str | None:
     """Return the id that a reference names; None for anything else."""
     if isinstance(plugin, Mapping) and plugin.get("type") == "ref":
         return str(plugin["id"])
     return None
 
 
-def _numbers(value: object) -> Doubles:
+def _parse_numbers(value: object) -> Float64Array:
     """Return a number (1,), or the three of a color; NaN for anything else."""
     if isinstance(value, Mapping):
         is_constant = value.get("type") in ("rgb", "uniform", "spectrum", "srgb")
@@ -373,7 +396,7 @@ def _numbers(value: object) -> Doubles:
 # ---- The surface of a Mitsuba shape: its base color, which is searched; all the rest
 # stays as it is
 
-COLORS = {  # surfaces with a base color, and its name there
+BASE_COLOR_KEYS = {  # surfaces with a base color, and its name there
     "diffuse": "reflectance",
     "principled": "base_color",
     "principledthin": "base_color",
@@ -381,18 +404,20 @@ COLORS = {  # surfaces with a base color, and its name there
     "roughplastic": "diffuse_reflectance",
     "pplastic": "diffuse_reflectance",
 }
-GREY = 0.5  # reflectance of a surface that states none: Mitsuba's default
-PLAIN_SIZE = 8  # width and height of a base color that is the same everywhere
+DEFAULT_REFLECTANCE = (
+    0.5  # reflectance of a surface that states none: Mitsuba's default
+)
+CONSTANT_SIZE = 8  # width and height of a base color that is the same everywhere
 # smallest width and height of a base color whose texels are not interpolated: smaller
 # ones are repeated
-SHARP_SIZE = 256
+MIN_NEAREST_SIZE = 256
 # looked up by texture coordinates, after a transform of their own
-PLACED = frozenset(("bitmap", "checkerboard"))
-BOUND = PLACED | {"mesh_attribute", "normalmap", "bumpmap", "hair"}
+UV_TEXTURES = frozenset(("bitmap", "checkerboard"))
+MESH_BOUND_PLUGINS = UV_TEXTURES | {"mesh_attribute", "normalmap", "bumpmap", "hair"}
 """Plugins that look different with other texture coordinates, or without attributes."""
 # entries of surfaces that look different along u and v
-ANISOTROPIC = frozenset(("alpha_u", "alpha_v", "anisotropic"))
-OF_THE_PICTURE = frozenset(
+ANISOTROPIC_ENTRIES = frozenset(("alpha_u", "alpha_v", "anisotropic"))
+IMAGE_ENTRIES = frozenset(
     ("type", "id", "bitmap", "filename", "raw", "format", "to_uv")
 )
 """Entries of a bitmap that have been used once its pixels are read."""
@@ -405,25 +430,25 @@ class ShapeSurface:
     # its dictionary, with `{"type": BASE_COLOR}` and how the texture is looked up
     # (`wrap_mode`, `filter_type`) in the place of the base color, if it has one
     plugin: Plugin
-    # (H, W, 3) float32 display-referred, row 0 on top; `GREY` if it has no base color
-    base_color: Floats
-    picture: bool  # whether the base color varies over the surface
+    # (H, W, 3) float32 display-referred, row 0 on top; `DEFAULT_REFLECTANCE` if it has no base color
+    base_color: Float32Array
+    is_textured: bool  # whether the base color varies over the surface
     # (3, 3) from the mesh's texture coordinates to those of the base color and of
     # `plugin`, v downwards
-    to_uv: Doubles
-    bound: bool  # the mesh must keep its own texture coordinates and attributes
+    to_uv: Float64Array
+    is_bound: bool  # the mesh must keep its own texture coordinates and attributes
     notes: tuple[str, ...]  # clauses about what is not as in the scene
 
 
 class _Color(NamedTuple):
     """A base color."""
 
-    linear: Floats  # (H, W, 3)
+    linear: Float32Array  # (H, W, 3)
     options: Plugin  # how it is looked up
     to_uv: object = None  # its own transform of texture coordinates
 
 
-def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
+def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
     """Take the first base color out of a surface: a color, a bitmap or a checkerboard.
 
     Whatever else is looked up by texture coordinates stays as it is: where the base
@@ -431,24 +456,26 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
     """
     surface, color = _take_base_color(bsdf)
     if color is None:
-        grey = np.full((PLAIN_SIZE, PLAIN_SIZE, 3), GREY, np.float32)
+        grey = np.full(
+            (CONSTANT_SIZE, CONSTANT_SIZE, 3), DEFAULT_REFLECTANCE, np.float32
+        )
         color = _Color(grey, {})
     linear = color.linear
-    is_constant = linear.shape[:2] == (PLAIN_SIZE, PLAIN_SIZE) and not bool(
+    is_constant = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE) and not bool(
         np.ptp(linear, axis=(0, 1)).any()
     )
     is_bound = any(
-        plugin["type"] in BOUND or ANISOTROPIC & set(plugin)
-        for plugin in plugins_in(surface)
+        plugin["type"] in MESH_BOUND_PLUGINS or ANISOTROPIC_ENTRIES & set(plugin)
+        for plugin in iterate_plugins(surface)
     )
-    notes = _surface_notes(surface, linear)
+    notes = _describe_surface(surface, linear)
     surface, to_uv = _apply_uv_transform(surface, color.to_uv)
     return ShapeSurface(
         plugin=surface,
         base_color=linear_to_srgb(np.clip(linear, 0.0, 1.0)),
-        picture=not is_constant,
+        is_textured=not is_constant,
         to_uv=to_uv,
-        bound=is_bound,
+        is_bound=is_bound,
         notes=tuple(notes),
     )
 
@@ -459,20 +486,20 @@ def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]
 
     def replace_color(plugin: Mapping[str, object]) -> Plugin:
         nonlocal base
-        key = COLORS.get(str(plugin["type"]))
+        key = BASE_COLOR_KEYS.get(str(plugin["type"]))
         if key is not None and base is None:
-            base = _color(plugin.get(key, GREY))
+            base = _parse_base_color(plugin.get(key, DEFAULT_REFLECTANCE))
             if base is not None:
                 plugin = {**plugin, key: {"type": BASE_COLOR, **base.options}}
-        return with_inner(plugin, replace_color)
+        return map_inner_plugins(plugin, replace_color)
 
     return replace_color(bsdf), base
 
 
-def _surface_notes(surface: Plugin, linear: Floats) -> list[str]:
+def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
     """Return clauses about what of a surface is not as in the scene."""
     notes = []
-    types = {str(plugin["type"]) for plugin in plugins_in(surface)}
+    types = {str(plugin["type"]) for plugin in iterate_plugins(surface)}
     if BASE_COLOR not in types:
         kinds = sorted(types & {"mesh_attribute", "volume"})
         if kinds:
@@ -488,7 +515,9 @@ def _surface_notes(surface: Plugin, linear: Floats) -> list[str]:
     return notes
 
 
-def _apply_uv_transform(surface: Plugin, transform: object) -> tuple[Plugin, Doubles]:
+def _apply_uv_transform(
+    surface: Plugin, transform: object
+) -> tuple[Plugin, Float64Array]:
     """Apply a base color's transform of texture coordinates.
 
     The mesh's texture coordinates can be transformed where that can be undone, and
@@ -499,10 +528,10 @@ def _apply_uv_transform(surface: Plugin, transform: object) -> tuple[Plugin, Dou
         The surface with changed transforms, and the (3, 3) transform of the mesh's
         texture coordinates.
     """
-    to_uv = np.eye(3) if transform is None else uv_matrix(transform)
+    to_uv = np.eye(3) if transform is None else to_uv_matrix(transform)
     uses_tangents = any(
-        plugin["type"] in ("normalmap", "hair") or ANISOTROPIC & set(plugin)
-        for plugin in plugins_in(surface)
+        plugin["type"] in ("normalmap", "hair") or ANISOTROPIC_ENTRIES & set(plugin)
+        for plugin in iterate_plugins(surface)
     )
     keeps_tangents = to_uv[1, 0] == 0.0 and to_uv[0, 0] > 0.0
     is_invertible = abs(np.linalg.det(to_uv)) > 1e-12
@@ -510,28 +539,30 @@ def _apply_uv_transform(surface: Plugin, transform: object) -> tuple[Plugin, Dou
         return _with_transform(surface, to_uv, BASE_COLOR), np.eye(3)
     if not np.array_equal(to_uv, np.eye(3)):
         inverse = np.asarray(np.linalg.inv(to_uv), np.float64)
-        surface = _with_transform(surface, inverse, *PLACED)
+        surface = _with_transform(surface, inverse, *UV_TEXTURES)
     return surface, to_uv
 
 
 def _with_transform(
-    plugin: Mapping[str, object], before: Doubles, *kinds: str
+    plugin: Mapping[str, object], before: Float64Array, *kinds: str
 ) -> Plugin:
     """Return a plugin whose textures of some kinds have one more transform (3, 3).
 
     Texture coordinates go through it before the texture's own.
     """
-    changed = with_inner(plugin, lambda inner: _with_transform(inner, before, *kinds))
+    changed = map_inner_plugins(
+        plugin, lambda inner: _with_transform(inner, before, *kinds)
+    )
     if changed["type"] in kinds:
         transform = np.eye(4)
         transform[np.ix_((0, 1, 3), (0, 1, 3))] = (
-            uv_matrix(plugin.get("to_uv", np.eye(3))) @ before
+            to_uv_matrix(plugin.get("to_uv", np.eye(3))) @ before
         )
         changed["to_uv"] = transform
     return changed
 
 
-def uv_matrix(value: object) -> Doubles:
+def to_uv_matrix(value: object) -> Float64Array:
     """Return a transform of texture coordinates (3, 3).
 
     Of one with (4, 4) it is what Mitsuba takes.
@@ -540,17 +571,17 @@ def uv_matrix(value: object) -> Doubles:
     return matrix if matrix.shape == (3, 3) else matrix[np.ix_((0, 1, 3), (0, 1, 3))]
 
 
-def _color(value: object) -> _Color | None:
+def _parse_base_color(value: object) -> _Color | None:
     """Return a color, a checkerboard or a bitmap as a base color; None of all else."""
-    same_everywhere = constant(value)
+    same_everywhere = parse_constant_color(value)
     if same_everywhere is not None:
-        size = (PLAIN_SIZE, PLAIN_SIZE, 3)
+        size = (CONSTANT_SIZE, CONSTANT_SIZE, 3)
         return _Color(np.broadcast_to(same_everywhere, size), {})
     if not isinstance(value, Mapping):
         return None
     if value["type"] == "checkerboard":
-        dark = constant(value.get("color0", 0.4))
-        light = constant(value.get("color1", 0.2))
+        dark = parse_constant_color(value.get("color0", 0.4))
+        light = parse_constant_color(value.get("color1", 0.2))
         unknown = set(value) - {"type", "id", "color0", "color1", "to_uv"}
         if dark is None or light is None or unknown:
             return None
@@ -558,22 +589,22 @@ def _color(value: object) -> _Color | None:
         return _Color(
             _repeat_texels(board), {"filter_type": "nearest"}, value.get("to_uv")
         )
-    pixels = _pixels(value) if value["type"] == "bitmap" else None
+    pixels = _read_pixels(value) if value["type"] == "bitmap" else None
     if pixels is None:
         return None
-    options = {key: entry for key, entry in value.items() if key not in OF_THE_PICTURE}
+    options = {key: entry for key, entry in value.items() if key not in IMAGE_ENTRIES}
     if options.get("filter_type") == "nearest":
         pixels = _repeat_texels(pixels)
     return _Color(pixels, options, value.get("to_uv"))
 
 
-def _repeat_texels(texture: Floats) -> Floats:
+def _repeat_texels(texture: Float32Array) -> Float32Array:
     """Repeat texels so that none is blurred where a control keeps the texture's size."""
-    down, across = (-(-SHARP_SIZE // size) for size in texture.shape[:2])
+    down, across = (-(-MIN_NEAREST_SIZE // size) for size in texture.shape[:2])
     return texture.repeat(down, axis=0).repeat(across, axis=1)
 
 
-def _pixels(value: Mapping[str, object]) -> Floats | None:
+def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
     """Return the linear values (H, W, 3) of a bitmap; None if it cannot be read here."""
     image = value.get("bitmap")
     if isinstance(image, np.ndarray):
@@ -595,9 +626,9 @@ def _pixels(value: Mapping[str, object]) -> Floats | None:
     )
 
 
-def constant(value: object) -> Floats | None:
+def parse_constant_color(value: object) -> Float32Array | None:
     """Return a color (3,) that is the same everywhere; None for anything else."""
-    numbers = _numbers(value)
+    numbers = _parse_numbers(value)
     if np.isnan(numbers).any():
         return None
     return np.broadcast_to(numbers, (3,)).astype(np.float32)

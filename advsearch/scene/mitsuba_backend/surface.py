@@ -17,30 +17,30 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.scene.assets import Floats
+from advsearch.scene.assets import Float32Array
 from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.mitsuba_backend import texel_rays
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import Recordings, dr, mi, one_at_a_time
+from advsearch.scene.mitsuba_backend.variant import Recordings, dr, mi, mitsuba_lock
 
 # Spreads of gloss between which one ray to the ground gives way to what surrounds the
 # object.
-SHARP = 0.15
-WIDE = 0.4
-CAMERA = 16  # numbers of a camera in the kernel, see `_camera_numbers`
-PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
+MIN_BLENDED_SPREAD = 0.15
+MAX_BLENDED_SPREAD = 0.4
+CAMERA_SIZE = 16  # numbers of a camera in the kernel, see `_camera_numbers`
+RAY_PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
 """Positions of the rays of a pixel in it.
 
 It is a rotated grid, which samples upright and level edges at four positions.
 """
-RAYS = len(PATTERN)
+RAYS_PER_PIXEL = len(RAY_PATTERN)
 # fraction of a ray's light below which what is behind a cut-out does not count
-LEAST = 1e-3
+MIN_TRANSMITTANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Lit:
-    """The light of one moment, as `Views` looks it up.
+class LightMaps:
+    """The light of one moment, as `ViewTracer` looks it up.
 
     The maps are flat Dr.Jit arrays, three numbers for each color.
     """
@@ -55,12 +55,12 @@ class Lit:
     blurred_shape: tuple[int, int]
 
     @property
-    def numbers(self) -> int:
+    def size(self) -> int:
         """Number of floats in all maps."""
         return len(self.texels) + len(self.sky) + len(self.blurred)
 
 
-def lit_arrays(texels: Tensor, padded: Tensor, blurred: Tensor) -> Lit:
+def make_light_maps(texels: Tensor, padded: Tensor, blurred: Tensor) -> LightMaps:
     """Make light maps for look-ups, in memory of their own.
 
     Args:
@@ -73,7 +73,7 @@ def lit_arrays(texels: Tensor, padded: Tensor, blurred: Tensor) -> Lit:
         # one number more, since colors are gathered by four numbers
         return mi.Float(functional.pad(values, (0, 1)).numpy().ravel())
 
-    return Lit(
+    return LightMaps(
         texels=flatten(texels),
         sky=flatten(padded),
         sky_shape=(padded.shape[-3], padded.shape[-2]),
@@ -83,21 +83,21 @@ def lit_arrays(texels: Tensor, padded: Tensor, blurred: Tensor) -> Lit:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """What cameras see, by `Views`."""
+class ViewSamples:
+    """What cameras see, by `ViewTracer`."""
 
     # (n, H, W, 3) radiance without what the searched texture reflects diffusely
-    rest: Tensor
-    covered: Tensor  # (n, H, W, 1) fraction of each pixel that surfaces cover
-    # (k,) int64, the rays that see the searched texture, ascending; `RAYS` a pixel, row
+    radiance: Tensor
+    coverage: Tensor  # (n, H, W, 1) fraction of each pixel that surfaces cover
+    # (k,) int64, the rays that see the searched texture, ascending; `RAYS_PER_PIXEL` a pixel, row
     # by row. One that goes through cut-outs sees it several times
     sample: Tensor
     uv: Tensor  # (k, 2) texture coordinates there, as Mitsuba has them
     weight: Tensor  # (k,) the diffuse fraction over pi, and over the rays of a pixel
-    back: Tensor  # (k,) bool, whether it is seen from behind
+    is_back: Tensor  # (k,) bool, whether it is seen from behind
 
 
-class Views:
+class ViewTracer:
     """Trace rays through many cameras of a scene in one recorded launch.
 
     Args:
@@ -118,39 +118,42 @@ class Views:
         grids: Sequence[texel_rays.TexelGrid],
         lobes: Sequence[texel_rays.Lobes],
         widths: Sequence[float],
-        photographed: float | None,
+        photograph_height: float | None,
         model: CameraModel | None,
-        middle: Floats,
+        center: Float32Array,
     ) -> None:
         self._scene = scene
         self._grids = tuple(grids)
         self._widths = tuple(widths)
-        self._photographed = photographed
-        self._middle = middle.tolist()
+        self._photographed = photograph_height
+        self._middle = center.tolist()
         tables = [
-            np.concatenate([getattr(surface, name) for name in texel_rays.TABLES])
+            np.concatenate([getattr(surface, name) for name in texel_rays.LOBE_TABLES])
             for surface in lobes
         ]
         self._tables = np.concatenate(tables).astype(np.float32)
         self._lens = None if model is None else self._make_lens_table(model)
         self._recorded = Recordings()
 
-    def _make_lens_table(self, model: CameraModel) -> Floats:
+    def _make_lens_table(self, model: CameraModel) -> Float32Array:
         """Return the lens's rays through each pixel, flat, four numbers each."""
         height, width = self._scene.resolution
         row, column, ray_index = np.meshgrid(
-            np.arange(height), np.arange(width), np.arange(RAYS), indexing="ij"
+            np.arange(height),
+            np.arange(width),
+            np.arange(RAYS_PER_PIXEL),
+            indexing="ij",
         )
-        x_offset, y_offset = np.array(PATTERN)[ray_index.ravel()].T
+        x_offset, y_offset = np.array(RAY_PATTERN)[ray_index.ravel()].T
         x = (column.ravel() + x_offset) / width
         y = (row.ravel() + y_offset) / height
         positions = torch.from_numpy(np.stack([x, y], axis=1))
-        table: Floats = model.table(positions).numpy().ravel()
+        table: Float32Array = model.make_ray_table(positions).numpy().ravel()
         return table
 
     def __call__(
-        self, cameras: Sequence[Mapping[str, Tensor]], lit: Lit
-    ) -> Callable[[], Seen]:
+        self, cameras: Sequence[Mapping[str, Tensor]], lit: LightMaps
+    ) -> Callable[[], ViewSamples]:
         """Start to trace a lit scene through cameras.
 
         Args:
@@ -162,7 +165,7 @@ class Views:
             A function that waits for the result and returns it; until it is called the
             processor may do other things.
         """
-        with one_at_a_time:
+        with mitsuba_lock:
             height, width = self._scene.resolution
             count = len(cameras)
             camera_rows = np.stack(
@@ -177,21 +180,21 @@ class Views:
                 lens: Any,
                 *maps: Any,
             ) -> Any:
-                recorded_lit = Lit(
+                recorded_lit = LightMaps(
                     maps[0], maps[1], lit.sky_shape, maps[2], lit.blurred_shape
                 )
                 return self._trace(
                     mitsuba_scene, lane, tables, cameras, lens, recorded_lit
                 )
 
-            recording = self._recorded.of(
+            recording = self._recorded.get_or_record(
                 (count, lit.sky_shape, lit.blurred_shape), trace, []
             )
             lens = np.zeros(1, np.float32) if self._lens is None else self._lens
             arrays = [
                 mi.Float(values) for values in (self._tables, camera_rows.ravel(), lens)
             ]
-            lane = dr.arange(mi.UInt32, count * height * width * RAYS)
+            lane = dr.arange(mi.UInt32, count * height * width * RAYS_PER_PIXEL)
             # A recording takes its size from its arguments; without the lanes it would
             # be that of the scene's map.
             dr.eval(lane)
@@ -207,7 +210,7 @@ class Views:
         tables: Any,
         cameras: Any,
         lens: Any,
-        lit: Lit,
+        lit: LightMaps,
     ) -> list[Any]:
         """Trace all rays: the recorded kernel.
 
@@ -241,32 +244,38 @@ class Views:
             radiance += dr.select(valid, stopped * surface_radiance, 0.0)
             escapes = active & ~si.is_valid()
             radiance += dr.select(escapes, left * _look_up_sky(lit, d, to_local), 0.0)
-            covered += dr.select(valid, stopped / RAYS, 0.0)
-            texture += [si.uv.x, si.uv.y, side * stopped * diffuse / (math.pi * RAYS)]
+            covered += dr.select(valid, stopped / RAYS_PER_PIXEL, 0.0)
+            texture += [
+                si.uv.x,
+                si.uv.y,
+                side * stopped * diffuse / (math.pi * RAYS_PER_PIXEL),
+            ]
             left = left - stopped
-            active = valid & (left > LEAST)
+            active = valid & (left > MIN_TRANSMITTANCE)
             ray = si.spawn_ray(d)
-        radiance /= RAYS
+        radiance /= RAYS_PER_PIXEL
         # a sum in a kernel of its own for each channel would trace all rays again
         dr.eval(radiance, covered, texture)
-        pixel_sums = [dr.block_sum(channel, RAYS) for channel in (*radiance, covered)]
+        pixel_sums = [
+            dr.block_sum(channel, RAYS_PER_PIXEL) for channel in (*radiance, covered)
+        ]
         return [*pixel_sums, *texture]
 
     def _make_rays(self, lane: Any, cameras: Any, lens: Any) -> tuple[Any, Any]:
         """Return the ray of each lane, and whether the lens has one there."""
         height, width = self._scene.resolution
-        pixel = lane // RAYS
-        ray_index = lane % RAYS
+        pixel = lane // RAYS_PER_PIXEL
+        ray_index = lane % RAYS_PER_PIXEL
         view = pixel // (height * width)
         pixel = pixel % (height * width)
-        x_offset = mi.Float(PATTERN[0][0])
-        y_offset = mi.Float(PATTERN[0][1])
-        for index, offset in enumerate(PATTERN[1:], 1):
+        x_offset = mi.Float(RAY_PATTERN[0][0])
+        y_offset = mi.Float(RAY_PATTERN[0][1])
+        for index, offset in enumerate(RAY_PATTERN[1:], 1):
             x_offset = dr.select(ray_index == index, offset[0], x_offset)
             y_offset = dr.select(ray_index == index, offset[1], y_offset)
         camera = [
-            dr.gather(mi.Float, cameras, view * CAMERA + index)
-            for index in range(CAMERA)
+            dr.gather(mi.Float, cameras, view * CAMERA_SIZE + index)
+            for index in range(CAMERA_SIZE)
         ]
         if self._lens is None:
             column = mi.Float(pixel % width) + x_offset
@@ -276,7 +285,7 @@ class Views:
             z = mi.Float(1.0)
             active = mi.Bool(True)
         else:
-            entry = 4 * (pixel * RAYS + ray_index)
+            entry = 4 * (pixel * RAYS_PER_PIXEL + ray_index)
             x = dr.gather(mi.Float, lens, entry)
             y = dr.gather(mi.Float, lens, entry + 1)
             z = dr.gather(mi.Float, lens, entry + 2)
@@ -289,7 +298,13 @@ class Views:
         return mi.Ray3f(origin, dr.normalize(mi.Vector3f(*direction))), active
 
     def _shade(
-        self, mitsuba_scene: Any, si: Any, valid: Any, d: Any, tables: Any, lit: Lit
+        self,
+        mitsuba_scene: Any,
+        si: Any,
+        valid: Any,
+        d: Any,
+        tables: Any,
+        lit: LightMaps,
     ) -> tuple[Any, Any, Any]:
         """Shade what a ray in direction d hit.
 
@@ -331,19 +346,19 @@ class Views:
 
         The value lies between the two entries next to the angle.
         """
-        n_tables = len(texel_rays.TABLES)
+        n_tables = len(texel_rays.LOBE_TABLES)
         table = mi.UInt32(0)
         for index, mask in enumerate(masks):
-            first_entry = mi.UInt32(index * n_tables * texel_rays.ANGLES)
+            first_entry = mi.UInt32(index * n_tables * texel_rays.N_ANGLES)
             table = dr.select(mask, first_entry, table)
         position = dr.clip(
-            cosine * texel_rays.ANGLES - 0.5, 0.0, texel_rays.ANGLES - 1.0
+            cosine * texel_rays.N_ANGLES - 0.5, 0.0, texel_rays.N_ANGLES - 1.0
         )
-        lower = dr.minimum(mi.UInt32(position), texel_rays.ANGLES - 2)
+        lower = dr.minimum(mi.UInt32(position), texel_rays.N_ANGLES - 2)
         fraction = position - mi.Float(lower)
         values = []
         for index in range(n_tables):
-            entry = table + index * texel_rays.ANGLES + lower
+            entry = table + index * texel_rays.N_ANGLES + lower
             first = dr.gather(mi.Float, tables, entry)
             second = dr.gather(mi.Float, tables, entry + 1)
             values.append(first + fraction * (second - first))
@@ -358,7 +373,7 @@ class Views:
         cosine: Any,
         lobe: Sequence[Any],
         active: Any,
-        lit: Lit,
+        lit: LightMaps,
     ) -> Any:
         """Return the radiance in the gloss of what a ray in direction d hit.
 
@@ -372,7 +387,7 @@ class Views:
         wo = dr.normalize(n * up + tangent * along)
         si_wo = texel_rays.find_opaque_hits(
             mitsuba_scene,
-            mi.Ray3f(si.p + n * texel_rays.SHIFT, wo),
+            mi.Ray3f(si.p + n * texel_rays.RAY_OFFSET, wo),
             n_layers,
             active=active,
         )
@@ -387,13 +402,17 @@ class Views:
         # On the ground one ray meets a single place: the wider the lobe, the more
         # counts what surrounds the object, which is darker where the ground is darker
         # there than far off.
-        far_ground = mi.UInt32(self._grids[-1].first + self._grids[-1].count)
+        far_ground = mi.UInt32(self._grids[-1].first_cell + self._grids[-1].n_cells)
         shade = texel / _gather_color(lit.texels, far_ground)
         on_ground = mi.Bool(False)
         for grid, mask in zip(self._grids, masks_wo, strict=True):
             on_ground |= mask & (grid.warp is not None)
         spread = dr.sqrt(0.5 * (core * core + tail * tail))
-        wideness = dr.clip((spread - SHARP) / (WIDE - SHARP), 0.0, 1.0)
+        wideness = dr.clip(
+            (spread - MIN_BLENDED_SPREAD) / (MAX_BLENDED_SPREAD - MIN_BLENDED_SPREAD),
+            0.0,
+            1.0,
+        )
         single_ray = self._look_up_diffuse(si_wo, masks_wo, lit, to_local)
         ground = single_ray + wideness * (blurred * shade - single_ray)
         return dr.select(si_wo.is_valid(), dr.select(on_ground, ground, texel), blurred)
@@ -411,7 +430,7 @@ class Views:
         return dr.select(direction.z < -1e-3, dr.normalize(from_center), direction)
 
     def _look_up_diffuse(
-        self, si: Any, masks: Sequence[Any], lit: Lit, to_local: Any
+        self, si: Any, masks: Sequence[Any], lit: LightMaps, to_local: Any
     ) -> Any:
         """Return the diffuse radiance of what was hit.
 
@@ -426,7 +445,7 @@ class Views:
                     radiance = dr.select(mask, radiance * photograph, radiance)
         return radiance
 
-    def _look_up_texel(self, si: Any, masks: Sequence[Any], lit: Lit) -> Any:
+    def _look_up_texel(self, si: Any, masks: Sequence[Any], lit: LightMaps) -> Any:
         """Return what the texels around a hit have, bilinear; 0 on no grid."""
         first = mi.UInt32(0)
         n_rows = mi.UInt32(1)
@@ -439,7 +458,7 @@ class Views:
             y = dr.select(mask, grid_y, y)
             x = dr.select(mask, grid_x, x)
             on_any_grid = on_any_grid | mask
-            first = dr.select(mask, mi.UInt32(grid.first), first)
+            first = dr.select(mask, mi.UInt32(grid.first_cell), first)
             n_rows = dr.select(mask, mi.UInt32(grid.shape[0]), n_rows)
             n_columns = dr.select(mask, mi.UInt32(grid.shape[1]), n_columns)
         row = y * mi.Float(n_rows) - 0.5
@@ -448,8 +467,10 @@ class Views:
         return dr.select(on_any_grid, radiance, 0.0)
 
 
-def _camera_numbers(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:
-    """Return the `CAMERA` numbers of a camera as the kernel takes them.
+def _camera_numbers(
+    inputs: Mapping[str, Tensor], height: int, width: int
+) -> Float32Array:
+    """Return the `CAMERA_SIZE` numbers of a camera as the kernel takes them.
 
     They are its axes to the left, up and forward (9), its position (3), half its extent
     along x and y, and its center along x and y.
@@ -465,27 +486,27 @@ def _camera_numbers(inputs: Mapping[str, Tensor], height: int, width: int) -> Fl
     return np.concatenate([matrix[:3, :3].T.ravel(), matrix[:3, 3], extent, center])
 
 
-def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> Seen:
+def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
     """Copy what the kernel has computed into memory of torch.
 
     The size is the number of cameras, rows and columns.
     """
-    with one_at_a_time:
+    with mitsuba_lock:
         # three channels a layer, all layers of a ray, ray by ray
         u, v, weight = (
             np.stack([layer.numpy() for layer in channels[first::3]], axis=1).ravel()
             for first in (4, 5, 6)
         )
         (hits,) = np.nonzero(weight)
-        n_layers = len(weight) // (math.prod(size) * RAYS)
+        n_layers = len(weight) // (math.prod(size) * RAYS_PER_PIXEL)
         rest = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
-        return Seen(
-            rest=torch.from_numpy(rest).reshape(*size, 3),
-            covered=torch.from_numpy(channels[3].numpy().copy()).reshape(*size, 1),
+        return ViewSamples(
+            radiance=torch.from_numpy(rest).reshape(*size, 3),
+            coverage=torch.from_numpy(channels[3].numpy().copy()).reshape(*size, 1),
             sample=torch.from_numpy(hits // n_layers),
             uv=torch.from_numpy(np.stack([u[hits], v[hits]], axis=1)),
             weight=torch.from_numpy(np.abs(weight[hits])),
-            back=torch.from_numpy(weight[hits] < 0.0),
+            is_back=torch.from_numpy(weight[hits] < 0.0),
         )
 
 
@@ -539,7 +560,7 @@ def _gather_color(values: Any, index: Any) -> Any:
     return mi.Color3f(*dr.gather(mi.Vector4f, values, index)[:3])
 
 
-def _look_up_sky(lit: Lit, direction: Any, to_local: Any) -> Any:
+def _look_up_sky(lit: LightMaps, direction: Any, to_local: Any) -> Any:
     """Look the environment up in a direction, as Mitsuba does.
 
     Rows go from pole to pole, and there are copies of columns at both ends.
@@ -554,7 +575,7 @@ def _look_up_sky(lit: Lit, direction: Any, to_local: Any) -> Any:
 
 
 def _look_up_blurred(
-    lit: Lit, direction: Any, to_local: Any, spread: Any, widths: Sequence[float]
+    lit: LightMaps, direction: Any, to_local: Any, spread: Any, widths: Sequence[float]
 ) -> Any:
     """Look up the environment blurred by a root mean square angle `spread`.
 

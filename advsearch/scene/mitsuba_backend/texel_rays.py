@@ -17,18 +17,18 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Doubles, Floats
+from advsearch.scene.assets import Float32Array, Float64Array
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import dr, mi, one_at_a_time
+from advsearch.scene.mitsuba_backend.variant import dr, mi, mitsuba_lock
 
 Ints = npt.NDArray[np.int32]
 Grids: TypeAlias = "Sequence[TexelGrid]"
-SHIFT = 1e-4  # how far from a surface rays begin, object sizes
-PASS = 1 << 20  # rays of one launch of `trace_texel_rays`
+RAY_OFFSET = 1e-4  # how far from a surface rays begin, object sizes
+RAYS_PER_LAUNCH = 1 << 20  # rays of one launch of `trace_texel_rays`
 # cut-outs that a ray goes through; what comes after them is taken for opaque
-LAYERS = 4
+MAX_CUT_OUT_LAYERS = 4
 # fraction of hits from outside on the backs of a shape's faces above which backs count
-FROM_BEHIND = 0.02
+MIN_BACK_FRACTION = 0.02
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class TexelGrid:
     """The texels over one surface, of a shape in Mitsuba's scene."""
 
     name: str
-    first: int  # index of its first cell among the cells of all grids
+    first_cell: int  # index of its first cell among the cells of all grids
     shape: tuple[int, int]  # rows and columns
     # None where it lies over texture coordinates; else (center x, center y, scale,
     # rate) of a level plane whose cells are small about its center: coordinate = center
@@ -45,7 +45,7 @@ class TexelGrid:
     side: int = 0  # of the faces that it lies on: 1 the front, -1 the back, 0 both
 
     @property
-    def count(self) -> int:
+    def n_cells(self) -> int:
         """Number of cells."""
         return self.shape[0] * self.shape[1]
 
@@ -54,8 +54,8 @@ def trace_texel_rays(
     scene: MitsubaScene,
     grids: Grids,
     sky_shape: tuple[int, int],
-    positions: Floats,
-    normals: Floats,
+    positions: Float32Array,
+    normals: Float32Array,
     n_rays: int,
     seed: int,
 ) -> Ints:
@@ -80,25 +80,27 @@ def trace_texel_rays(
     # The additive recurrence of the plastic number, which fills a square evenly
     # (Roberts 2018, The unreasonable effectiveness of quasirandom sequences).
     steps = np.array([0.7548776662466927, 0.5698402909980532])
-    points = _points(mi.Point2f, (np.arange(1, n_rays + 1)[:, None] * steps) % 1.0)
+    points = _to_drjit_points(
+        mi.Point2f, (np.arange(1, n_rays + 1)[:, None] * steps) % 1.0
+    )
     count = len(positions)
     shifts = np.random.default_rng(seed).random((count, 2), dtype=np.float32)
     met_cells = np.empty((count, n_rays), dtype=np.int32)
-    texels_per_launch = max(1, PASS // n_rays)
+    texels_per_launch = max(1, RAYS_PER_LAUNCH // n_rays)
     for begin in range(0, count, texels_per_launch):
         batch = slice(begin, min(count, begin + texels_per_launch))
         lane = dr.arange(mi.UInt32, (batch.stop - begin) * n_rays)
         texel = lane // n_rays
         ray_index = lane % n_rays
-        shift = _points(mi.Point2f, shifts[batch], texel)
+        shift = _to_drjit_points(mi.Point2f, shifts[batch], texel)
         square = dr.gather(mi.Point2f, points, ray_index) + shift
         square -= dr.floor(square)
         met = _trace_batch(
             scene,
             grids,
             sky_shape,
-            _points(mi.Normal3f, normals[batch], texel),
-            _points(mi.Point3f, positions[batch], texel),
+            _to_drjit_points(mi.Normal3f, normals[batch], texel),
+            _to_drjit_points(mi.Point3f, positions[batch], texel),
             square,
             (seed, begin),
         )
@@ -119,12 +121,12 @@ def _trace_batch(
     mitsuba_scene = scene._scene
     n_layers = count_cut_out_layers(scene)
     direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
-    ray = mi.Ray3f(position + normal * SHIFT, direction)
+    ray = mi.Ray3f(position + normal * RAY_OFFSET, direction)
     chance = _sample_chances(n_layers, dr.width(square), seed)
     si = find_opaque_hits(mitsuba_scene, ray, n_layers, chance)
 
     # What escapes meets a cell of the environment.
-    n_cells = grids[-1].first + grids[-1].count
+    n_cells = grids[-1].first_cell + grids[-1].n_cells
     n_rows, n_columns = sky_shape
     column, row = compute_map_position(direction, world_to_map(scene))
     sky_column = mi.UInt32(column * n_columns) % n_columns
@@ -139,7 +141,7 @@ def _trace_batch(
             is_hit &= dr.dot(si.n, direction) < 0.0
         y, x = compute_grid_position(grid, si.p, si.uv)
         nearest = mi.Int32(
-            grid.first
+            grid.first_cell
             + _cell_index(y, grid.shape[0]) * grid.shape[1]
             + _cell_index(x, grid.shape[1])
         )
@@ -148,8 +150,11 @@ def _trace_batch(
 
 
 def compute_visible_cosines(
-    scene: MitsubaScene, positions: Floats, normals: Floats, directions: Floats
-) -> Floats:
+    scene: MitsubaScene,
+    positions: Float32Array,
+    normals: Float32Array,
+    directions: Float32Array,
+) -> Float32Array:
     """Return the fraction of light from given directions that texels receive.
 
     Args:
@@ -164,13 +169,13 @@ def compute_visible_cosines(
     world = (directions @ np.array(world_to_map(scene))).astype(np.float32)
     lane = dr.arange(mi.UInt32, len(positions) * len(world))
     texel = lane // len(world)
-    position = _points(mi.Point3f, positions, texel)
-    normal = _points(mi.Normal3f, normals, texel)
-    direction = _points(mi.Vector3f, world, lane % len(world))
+    position = _to_drjit_points(mi.Point3f, positions, texel)
+    normal = _to_drjit_points(mi.Normal3f, normals, texel)
+    direction = _to_drjit_points(mi.Vector3f, world, lane % len(world))
     cosine = dr.dot(normal, direction)
     is_above = cosine > 0.0
     active = is_above
-    ray = mi.Ray3f(position + normal * SHIFT, direction)
+    ray = mi.Ray3f(position + normal * RAY_OFFSET, direction)
     transmittance = mi.Float(1.0)
     for _ in range(count_cut_out_layers(scene)):
         si = scene._scene.ray_intersect(ray, mi.RayFlags.UV, False, active)
@@ -186,32 +191,34 @@ def compute_visible_cosines(
     return np.asarray(received.numpy().reshape(len(positions), len(world)))
 
 
-def is_visible_from_behind(scene: MitsubaScene, name: str, positions: Floats) -> bool:
+def is_visible_from_behind(
+    scene: MitsubaScene, name: str, positions: Float32Array
+) -> bool:
     """Return whether backs of a shape's faces are visible from outside.
 
     That is so through a window, for example. The positions (n, 3) lie on the shape.
     """
     generator = np.random.default_rng(0)
-    directions = generator.standard_normal((PASS >> 7, 3))
+    directions = generator.standard_normal((RAYS_PER_LAUNCH >> 7, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions[:, 2] = np.abs(directions[:, 2])
     targets = positions[generator.integers(len(positions), size=len(directions))]
     distance = 2.0 * float(np.ptp(positions, axis=0).max())
-    inwards = _points(mi.Vector3f, (-directions).astype(np.float32))
+    inwards = _to_drjit_points(mi.Vector3f, (-directions).astype(np.float32))
     origins = (targets + distance * directions).astype(np.float32)
-    ray = mi.Ray3f(_points(mi.Point3f, origins), inwards)
+    ray = mi.Ray3f(_to_drjit_points(mi.Point3f, origins), inwards)
     n_layers = count_cut_out_layers(scene)
     chance = _sample_chances(n_layers, len(directions), (0,))
     si = find_opaque_hits(scene._scene, ray, n_layers, chance)
     grid = TexelGrid(name, 0, (1, 1))
     (is_hit,) = find_hit_grids(scene._scene, [grid], si, inwards)
     is_back = np.asarray((is_hit & (dr.dot(si.n, inwards) > 0.0)).numpy())
-    return bool(is_back.sum() > FROM_BEHIND * np.asarray(is_hit.numpy()).sum())
+    return bool(is_back.sum() > MIN_BACK_FRACTION * np.asarray(is_hit.numpy()).sum())
 
 
 def count_cut_out_layers(scene: MitsubaScene) -> int:
     """Return how many cut-outs a scene's rays go through; 0 where it has none."""
-    return LAYERS if scene.made[0].cut_out else 0
+    return MAX_CUT_OUT_LAYERS if scene.definition[0].has_opacity else 0
 
 
 def find_opaque_hits(
@@ -303,7 +310,9 @@ def _cell_index(fraction: Any, count: int) -> Any:
     return mi.Int32(dr.minimum(fraction * count, count - 1.0))
 
 
-def _points(kind: Any, rows: Floats | Doubles, index: Any = None) -> Any:
+def _to_drjit_points(
+    kind: Any, rows: Float32Array | Float64Array, index: Any = None
+) -> Any:
     """Convert rows of numbers to Dr.Jit's points, vectors or normals.
 
     With an index, return the row with that index in each lane.
@@ -315,69 +324,69 @@ def _points(kind: Any, rows: Floats | Doubles, index: Any = None) -> Any:
     return points if index is None else dr.gather(kind, points, index)
 
 
-ANGLES = 32  # entries of a table over the cosine of the angle of view
-LOBE_SAMPLES = 4096
+N_ANGLES = 32  # entries of a table over the cosine of the angle of view
+N_LOBE_SAMPLES = 4096
 # the tables of `Lobes`, in their order
-TABLES = ("diffuse", "gloss", "up", "along", "core", "tail")
+LOBE_TABLES = ("diffuse", "gloss", "up", "along", "core", "tail")
 
 
 @dataclass(frozen=True, eq=False)
 class Lobes:
     """Reflectance and gloss of a surface by the cosine of the angle of view.
 
-    Each table has `ANGLES` entries, the first at grazing angles.
+    Each table has `N_ANGLES` entries, the first at grazing angles.
     """
 
     # (k,) fraction of even light that it reflects for a base color of one, without the
     # gloss
-    diffuse: Floats
-    gloss: Floats  # (k,) fraction of even light reflected whatever the base color
-    up: Floats  # (k,) component of the gloss's mean direction along the normal
-    along: Floats  # (k,) and its component away from the viewer
+    diffuse: Float32Array
+    gloss: Float32Array  # (k,) fraction of even light reflected whatever the base color
+    up: Float32Array  # (k,) component of the gloss's mean direction along the normal
+    along: Float32Array  # (k,) and its component away from the viewer
     # (k,) root mean square angle about that direction, radians, of the nearer half of
     # the gloss
-    core: Floats
+    core: Float32Array
     # (k,) and of the other half: a lobe has longer tails than a normal distribution
-    tail: Floats
+    tail: Float32Array
 
     @classmethod
-    def matt(cls) -> Lobes:
+    def make_diffuse(cls) -> Lobes:
         """Return those of a diffuse surface."""
-        ones = np.ones(ANGLES, dtype=np.float32)
-        zeros = np.zeros(ANGLES, dtype=np.float32)
+        ones = np.ones(N_ANGLES, dtype=np.float32)
+        zeros = np.zeros(N_ANGLES, dtype=np.float32)
         return cls(ones, zeros, ones, zeros, zeros, zeros)
 
     @property
-    def mean_shares(self) -> tuple[float, float]:
+    def mean_reflectances(self) -> tuple[float, float]:
         """Diffuse and glossy fractions under even light, over all angles of view."""
-        weight = (np.arange(ANGLES) + 0.5) * 2.0 / ANGLES**2
+        weight = (np.arange(N_ANGLES) + 0.5) * 2.0 / N_ANGLES**2
         return float((weight * self.diffuse).sum()), float((weight * self.gloss).sum())
 
 
 class _BsdfSamples(NamedTuple):
     """Samples of a BSDF, each (ANGLES, LOBE_SAMPLES) float64."""
 
-    grey: Doubles  # value over a cosine density, for a base color of 0.5
-    black: Doubles  # the same for a base color of 0
-    weight: Doubles  # of a sampled direction, for a base color of 0
-    x: Doubles  # its component in the plane of view, towards the viewer
-    z: Doubles  # its component along the normal
+    grey: Float64Array  # value over a cosine density, for a base color of 0.5
+    black: Float64Array  # the same for a base color of 0
+    weight: Float64Array  # of a sampled direction, for a base color of 0
+    x: Float64Array  # its component in the plane of view, towards the viewer
+    z: Float64Array  # its component along the normal
 
 
-def measured(
+def measure_lobes(
     scene: MitsubaScene,
     inputs: Mapping[str, Tensor],
     grid: TexelGrid,
-    place: Floats,
-    normal: Floats,
+    position: Float32Array,
+    normal: Float32Array,
 ) -> Lobes:
     """Measure the BSDF of a shape at one of its texels, by sampling it.
 
-    The texel has a (3,) position `place` and a (3,) unit normal.
+    The texel has a (3,) position `position` and a (3,) unit normal.
     """
-    cosine = (np.arange(ANGLES) + 0.5) / ANGLES
-    with one_at_a_time:
-        samples = _sample_bsdf(scene, inputs, grid, place, normal, cosine)
+    cosine = (np.arange(N_ANGLES) + 0.5) / N_ANGLES
+    with mitsuba_lock:
+        samples = _sample_bsdf(scene, inputs, grid, position, normal, cosine)
     gloss = samples.weight.mean(axis=1)
     mean_x = (samples.weight * samples.x).mean(axis=1)
     mean_z = (samples.weight * samples.z).mean(axis=1)
@@ -405,13 +414,13 @@ def _sample_bsdf(
     scene: MitsubaScene,
     inputs: Mapping[str, Tensor],
     grid: TexelGrid,
-    position: Floats,
-    normal: Floats,
-    cosines: Doubles,
+    position: Float32Array,
+    normal: Float32Array,
+    cosines: Float64Array,
 ) -> _BsdfSamples:
     """Sample the BSDF at a point for each cosine of the angle of view."""
-    n_samples = ANGLES * LOBE_SAMPLES
-    cosine = dr.repeat(mi.Float(cosines.astype(np.float32)), LOBE_SAMPLES)
+    n_samples = N_ANGLES * N_LOBE_SAMPLES
+    cosine = dr.repeat(mi.Float(cosines.astype(np.float32)), N_LOBE_SAMPLES)
     to_viewer = mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
     noise = mi.load_dict({"type": "independent"})
     noise.seed(0, n_samples)
@@ -424,9 +433,9 @@ def _sample_bsdf(
         """Return the hit as seen from each angle, with a base color set."""
         key = f"{grid.name}.base_color"
         changed = dict(inputs)
-        if key in scene.names:
-            changed[key] = torch.full_like(scene.base(key), base_color)
-        mitsuba_scene = scene.held(changed)
+        if key in scene.input_names:
+            changed[key] = torch.full_like(scene.get_base_value(key), base_color)
+        mitsuba_scene = scene.set_inputs(changed)
         start = mi.Point3f([float(x) for x in position + 1e-3 * normal])
         ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
         first_lane = dr.zeros(mi.UInt32, n_samples)
@@ -462,8 +471,8 @@ def _sample_bsdf(
 
 
 def _measure_spreads(
-    weight: Doubles, squared_angle: Doubles
-) -> tuple[Doubles, Doubles]:
+    weight: Float64Array, squared_angle: Float64Array
+) -> tuple[Float64Array, Float64Array]:
     """Return root mean square angles (k,) of both halves of weighted samples (k, n).
 
     The first is that of the half with smaller angles, the second that of the other.
@@ -480,5 +489,5 @@ def _measure_spreads(
     return core, tail
 
 
-def _to_table(values: npt.NDArray[Any]) -> Doubles:
-    return np.asarray(values, dtype=np.float64).reshape(ANGLES, LOBE_SAMPLES)
+def _to_table(values: npt.NDArray[Any]) -> Float64Array:
+    return np.asarray(values, dtype=np.float64).reshape(N_ANGLES, N_LOBE_SAMPLES)

@@ -10,13 +10,13 @@ and stores, for each vertex on a surface whose base color is an input,
 
 so that, to first order, the radiance of the pixel changes by the sum of weight x change
 of the base color at the vertex. The derivative of the BSDF is a difference: the BSDF is
-evaluated once more with all texels `STEP` larger. For a base color in which the BSDF is
+evaluated once more with all texels `COLOR_STEP` larger. For a base color in which the BSDF is
 affine (the diffuse and the metallic lobe of the principled BSDF) that is exact.
 Dr.Jit's forward mode finds the same, at the price of more kernels. For a projector's
 image, the weight is that of white projected light at the vertex. The whole path is one
 kernel, which also makes the image itself and what guides its denoiser.
 
-`first_hits` finds what the camera sees first.
+`find_first_hits` finds what the camera sees first.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from advsearch.scene.formation import Surfaces
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 # how much the base color is changed for the derivative of a BSDF with respect to it
-STEP = 0.0625
-ROUNDING = 1e-4  # relative change of a BSDF that counts as no change
+COLOR_STEP = 0.0625
+ROUNDING_ERROR = 1e-4  # relative change of a BSDF that counts as no change
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +48,14 @@ class Vertices:
     # counts
     weight: Tensor
     # (n,) bool: the camera sees it directly, or through mirrors and glass
-    sharp: Tensor
+    is_sharp: Tensor
 
-    def only(self, mask: Tensor) -> Vertices:
+    def select(self, mask: Tensor) -> Vertices:
         """Return the vertices that a mask (n,) selects."""
         if bool(mask.all()):
             return self
         return Vertices(
-            self.pixel[mask], self.uv[mask], self.weight[mask], self.sharp[mask]
+            self.pixel[mask], self.uv[mask], self.weight[mask], self.is_sharp[mask]
         )
 
 
@@ -74,7 +74,7 @@ class Paths:
     vertices: list[Vertices]  # by their index in the path
 
 
-def mean_of(passes: Sequence[Paths]) -> Paths:
+def average_passes(passes: Sequence[Paths]) -> Paths:
     """Return the mean images of passes with equal sample counts, without vertices."""
     names = ("radiance", "coverage", "background", "albedo", "normal")
     means = {
@@ -84,7 +84,7 @@ def mean_of(passes: Sequence[Paths]) -> Paths:
     return Paths(**means, vertices=[])
 
 
-def collect(
+def collect_paths(
     scene: Any,
     parameters: Any,
     key: str,
@@ -112,7 +112,7 @@ def collect(
     ray, weight = _sample_camera_rays(scene.sensors()[0], noise, size, spp)
     first_hit, emitted, bounces = _trace_paths(scene, ray, weight, noise, depth)
 
-    # The BSDFs are evaluated once more with the base color larger by `STEP`: their
+    # The BSDFs are evaluated once more with the base color larger by `COLOR_STEP`: their
     # differences are the derivatives. For a projector, its light is evaluated alone,
     # with a white image.
     texture = mi.TensorXf(parameters[key])
@@ -120,18 +120,18 @@ def collect(
     projected = list[tuple[Any, Any]]()
     try:
         if projector is None:
-            parameters[key] = texture + STEP
+            parameters[key] = texture + COLOR_STEP
             parameters.update()
-            slopes = [bounce.slopes() for bounce in bounces]
+            slopes = [bounce.compute_slopes() for bounce in bounces]
         else:
             parameters[key] = dr.full(mi.TensorXf, 1.0, texture.shape)
             parameters.update()
-            projected = [bounce.lit_by(scene, projector) for bounce in bounces]
+            projected = [bounce.eval_projector(scene, projector) for bounce in bounces]
     finally:
         parameters[key] = texture
         parameters.update()
 
-    L, vertices = _accumulate(bounces, emitted, slopes)
+    L, vertices = _accumulate_radiance(bounces, emitted, slopes)
     if projector is not None:
         vertices = [
             (uv, bounce.throughput * light, bounce.sharp)
@@ -155,7 +155,7 @@ def _sample_camera_rays(
     return ray, weight
 
 
-def _accumulate(
+def _accumulate_radiance(
     bounces: Sequence[Bounce], emitted: Sequence[Any], slopes: Sequence[tuple[Any, Any]]
 ) -> tuple[Any, list[tuple[Any, Any, Any]]]:
     """Accumulate radiance from the last vertex back to the camera.
@@ -252,10 +252,10 @@ class Bounce:
     # the same for the path's direction over its density: the throughput of the vertex
     bsdf_weight: Any
 
-    def slopes(self) -> tuple[Any, Any]:
+    def compute_slopes(self) -> tuple[Any, Any]:
         """Return the derivatives of both BSDF values by the base color.
 
-        The base color has to be larger by `STEP` now. The first derivative is that of
+        The base color has to be larger by `COLOR_STEP` now. The first derivative is that of
         `bsdf_value_em`, the second that of the path's direction over its density.
         """
         bsdf_value = self.bsdf_weight * self.bsdf_sample.pdf
@@ -268,12 +268,12 @@ class Bounce:
         """Return the change of a BSDF value over the change of the base color."""
         value = self.bsdf.eval(mi.BSDFContext(), self.si, wo, active)
         change = value - value_before
-        exceeds_rounding = dr.max(dr.abs(change)) > ROUNDING * dr.max(
+        exceeds_rounding = dr.max(dr.abs(change)) > ROUNDING_ERROR * dr.max(
             dr.abs(value_before)
         )
-        return dr.select(active & exceeds_rounding, change / STEP, 0.0)
+        return dr.select(active & exceeds_rounding, change / COLOR_STEP, 0.0)
 
-    def lit_by(self, scene: Any, projector: Any) -> tuple[Any, Any]:
+    def eval_projector(self, scene: Any, projector: Any) -> tuple[Any, Any]:
         """Return which part of a projector's image lights the vertex.
 
         The first value is the position in the image, the second the projector's light
@@ -426,7 +426,7 @@ def _sample_bounce(
     )
 
 
-def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces:
+def find_first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces:
     """Find the surface that the camera sees first through the center of each pixel.
 
     There is no noise: a thin lens is looked through at its center. What lets more than

@@ -24,14 +24,14 @@ Plugin = dict[str, Any]
 It has its `type`, and by Mitsuba's names numbers, strings, transforms, bitmaps, objects
 that are loaded already, and further plugins.
 """
-one_at_a_time = threading.RLock()
+mitsuba_lock = threading.RLock()
 """Lock with which one thread at a time renders, builds or denoises.
 
 They share what Dr.Jit records, and the denoiser's buffers.
 """
 
 
-def mitsuba() -> ModuleType:
+def import_mitsuba() -> ModuleType:
     """Import Mitsuba with the variant ``llvm_ad_rgb`` set.
 
     The first call imports it; later ones only look the variant up.
@@ -71,7 +71,7 @@ class _LazyModule:
         self._name = name
 
     def __getattr__(self, name: str) -> Any:
-        mitsuba()
+        import_mitsuba()
         return getattr(sys.modules[self._name], name)
 
 
@@ -80,7 +80,7 @@ dr: Any = _LazyModule("drjit")
 
 
 @contextmanager
-def fewer_warnings() -> Iterator[None]:
+def suppress_warnings() -> Iterator[None]:
     """Suppress Mitsuba's warnings inside the `with`, where advsearch reports itself."""
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
@@ -90,7 +90,9 @@ def fewer_warnings() -> Iterator[None]:
         mi.set_log_level(level)
 
 
-def recorded(render: Callable[..., Any], media: list[Any]) -> Callable[..., Any]:
+def record_on_first_use(
+    render: Callable[..., Any], media: list[Any]
+) -> Callable[..., Any]:
     """Return a function that Dr.Jit records on first use and replays later.
 
     Nothing may be freed while it records: memory that torch shares and scenes end with
@@ -124,10 +126,10 @@ class Recordings(dict[Any, Callable[..., Any]]):
 
     _recorded_at = (0, 0)
 
-    def of(
-        self, what: Any, render: Callable[..., Any], media: list[Any]
+    def get_or_record(
+        self, key: Any, render: Callable[..., Any], media: list[Any]
     ) -> Callable[..., Any]:
-        """Return the recording for a key; other arguments as for `recorded`.
+        """Return the recording for a key; other arguments as for `record_on_first_use`.
 
         If there is none yet, the first call of the returned function makes it.
         """
@@ -135,9 +137,9 @@ class Recordings(dict[Any, Callable[..., Any]]):
         if self._recorded_at != state:
             self.clear()
             self._recorded_at = state
-        if what not in self:
-            self[what] = recorded(render, media)
-        return self[what]
+        if key not in self:
+            self[key] = record_on_first_use(render, media)
+        return self[key]
 
 
 class Population:
@@ -168,7 +170,7 @@ class Population:
         self._held[self.changes] = objects, media
         weakref.finalize(owner, self.unused.append, self.changes)
 
-    def bury(self) -> None:
+    def free_unused(self) -> None:
         """Free what has lost its owner, if anything has; only between renders."""
         while self.unused:
             self._held.pop(self.unused.pop(), None)
@@ -177,7 +179,7 @@ class Population:
         gc.collect()
         self.changes += 1
 
-    def media(self) -> list[Any]:
+    def list_media(self) -> list[Any]:
         """Return the media of all scenes.
 
         What calls one of them is recorded with all that there are, and Dr.Jit 1.5.0

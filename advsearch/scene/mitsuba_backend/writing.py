@@ -21,34 +21,34 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.scene import parts
-from advsearch.scene.assets import Floats
+from advsearch.scene.assets import Float32Array
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.mitsuba_backend.meshes import (
-    base_texture,
-    emitter,
-    matt,
-    own_surface,
-    principled,
+    fill_base_color,
+    make_base_texture,
+    make_diffuse,
+    make_emitter,
+    make_principled,
 )
 from advsearch.scene.mitsuba_backend.parts import (
-    CAMERA_NUMBERS,
-    GROUND,
-    scene_dict,
-    translation,
+    CAMERA_KEYS,
+    GROUND_NAME,
+    make_scene_dict,
+    translate_part,
 )
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, mi
 
-NAME = "scene.xml"
-MATERIAL = ("roughness", "metallic", "specular", "clearcoat")
+SCENE_FILE_NAME = "scene.xml"
+MATERIAL_INPUTS = ("roughness", "metallic", "specular", "clearcoat")
 # further segments of paths in haze: stock Mitsuba counts those between scatterings as
 # well
-SCATTERINGS = 3
+EXTRA_DEPTH = 3
 # entries that can be set although a dictionary does not have them
-ABSENT = ("to_world", *CAMERA_NUMBERS.values())
+OPTIONAL_ENTRIES = ("to_world", *CAMERA_KEYS.values())
 # entries of a mesh from a file that the written mesh includes
-BAKED = ("filename", "to_world", "flip_tex_coords")
+BAKED_ENTRIES = ("filename", "to_world", "flip_tex_coords")
 
 
 def write_scene(
@@ -57,7 +57,7 @@ def write_scene(
     path: Path,
     note: str,
     *,
-    hide: bool = False,
+    hide_environment: bool = False,
 ) -> None:
     """Write a scene with its inputs set as XML that stock Mitsuba loads.
 
@@ -68,12 +68,12 @@ def write_scene(
         inputs: as for `MitsubaScene.pictures`.
         path: of the XML file, in a folder that exists.
         note: becomes a comment.
-        hide: hide the visible environment.
+        hide_environment: hide the visible environment.
 
     Raises:
         InputError: something in it is no part of stock Mitsuba.
     """
-    description, filter = scene.made
+    description, filter = scene.definition
     if description.camera_model is not None:
         raise InputError(
             "camera: stock Mitsuba has no sensor with distortion; export "
@@ -81,14 +81,14 @@ def write_scene(
         )
     integrator: Plugin = {
         # not `prbvolpath`, which starts outside of all media
-        "type": "volpath" if scene.volumetric else "path",
+        "type": "volpath" if scene.is_volumetric else "path",
         "max_depth": scene.max_depth,
-        "rr_depth": scene.roulette,
-        "hide_emitters": hide,
+        "rr_depth": scene.roulette_depth,
+        "hide_emitters": hide_environment,
     }
     xml_scene: Plugin = {
         "integrator": integrator,
-        **scene_dict(description, scene.resolution, filter, scene.sampler),
+        **make_scene_dict(description, scene.resolution, filter, scene.sampler),
     }
     # inputs that are not yet in what is written
     remaining = {
@@ -101,16 +101,18 @@ def write_scene(
         padded = remaining["environment.padded"]
         remaining["environment.padded"] = padded[:, 1:-1]
     if description.photograph is not None:
-        xml_scene[GROUND] = {
+        xml_scene[GROUND_NAME] = {
             "type": "ply",
-            "bsdf": matt(description.photograph.base.numpy()),
+            "bsdf": make_diffuse(description.photograph.base_color.numpy()),
         }
     for part in (description.meshes[OBJECT], *description.parts):
         _put_part(xml_scene, description, part, remaining)
     not_set = [
         name
         for name in sorted(remaining)
-        if not _put(xml_scene, scene.declared[name][0].split("."), remaining[name])
+        if not _put_input(
+            xml_scene, scene.declared_inputs[name][0].split("."), remaining[name]
+        )
     ]
     if not_set:
         raise InputError(
@@ -119,7 +121,7 @@ def write_scene(
         )
     meshes = {
         shape.id(): shape
-        for shape in scene.held(inputs).shapes()
+        for shape in scene.set_inputs(inputs).shapes()
         if shape.is_mesh() and shape.id() in xml_scene
     }
     write_xml(path, xml_scene, meshes, note)
@@ -135,9 +137,11 @@ def _put_part(
     if isinstance(part, parts.HazePart):
         _put_haze(xml_scene, part, remaining)
     elif isinstance(part, parts.MeshPart):
-        xml_scene[part.name] = _mesh(description.placed(part), remaining)
+        xml_scene[part.name] = _make_mesh(
+            description.get_positioned_part(part), remaining
+        )
     else:
-        xml_scene |= translation(description.placed(part)).plugins
+        xml_scene |= translate_part(description.get_positioned_part(part)).plugins
     if not isinstance(xml_scene.get(part.name, {}), Mapping):
         raise InputError(
             f"out: stock Mitsuba has nothing for {part.name}; export a run without it"
@@ -167,10 +171,10 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, remaining: Plugin) -> None:
         "interior": medium_reference,
     }
     scene["camera"]["medium"] = medium_reference
-    scene["integrator"]["max_depth"] += SCATTERINGS
+    scene["integrator"]["max_depth"] += EXTRA_DEPTH
 
 
-def _put(plugin: Plugin, key: list[str], value: Floats) -> bool:
+def _put_input(plugin: Plugin, key: list[str], value: Float32Array) -> bool:
     """Set a number, color, transform or image of a dictionary by Mitsuba's key.
 
     Returns:
@@ -187,8 +191,8 @@ def _put(plugin: Plugin, key: list[str], value: Floats) -> bool:
     entry = plugin.get(name)
     if isinstance(entry, Mapping):
         plugin[name] = dict(entry)
-        return bool(rest) and _put(plugin[name], rest, value)
-    if rest or (entry is None and name not in ABSENT):
+        return bool(rest) and _put_input(plugin[name], rest, value)
+    if rest or (entry is None and name not in OPTIONAL_ENTRIES):
         return False
     if name == "bitmap":
         plugin[name] = mi.Bitmap(np.ascontiguousarray(value))
@@ -199,7 +203,7 @@ def _put(plugin: Plugin, key: list[str], value: Floats) -> bool:
     return True
 
 
-def _mesh(part: parts.MeshPart, remaining: Plugin) -> Plugin:
+def _make_mesh(part: parts.MeshPart, remaining: Plugin) -> Plugin:
     """Return a mesh's plugin, and take its inputs from the remaining ones."""
     inputs = {
         name.partition(".")[2]: remaining.pop(name)
@@ -215,20 +219,24 @@ def _mesh(part: parts.MeshPart, remaining: Plugin) -> Plugin:
         part = replace(part, emission=radiance.reshape(-1, *size))
     if part.surface is None:
         numbers = {
-            name: float(inputs.pop(name)[0]) for name in MATERIAL if name in inputs
+            name: float(inputs.pop(name)[0])
+            for name in MATERIAL_INPUTS
+            if name in inputs
         }
-        surface = principled(replace(part, material=replace(part.material, **numbers)))
+        surface = make_principled(
+            replace(part, material=replace(part.material, **numbers))
+        )
     else:
         base_color = part.base_color
-        surface = own_surface(
-            part.surface, lambda options: base_texture(base_color, options)
+        surface = fill_base_color(
+            part.surface, lambda options: make_base_texture(base_color, options)
         )
     # the mesh that is written has them
     inputs.pop("vertices", None)
     inputs.pop("normals", None)
     remaining |= {f"{part.name}.{name}": value for name, value in inputs.items()}
     mesh: Plugin = {"type": "ply", "bsdf": surface}
-    light = emitter(part)
+    light = make_emitter(part)
     if light:
         mesh["emitter"] = light
     return mesh
@@ -253,7 +261,9 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
         if plugin["type"] == "ply" and name in meshes:
             file = files.reserve(name, ".ply")
             meshes[name].write_ply(str(file))
-            plugin = {key: entry for key, entry in plugin.items() if key not in BAKED}
+            plugin = {
+                key: entry for key, entry in plugin.items() if key not in BAKED_ENTRIES
+            }
             plugin["filename"] = file.name
         xml_scene[name] = files.write_files_of(name, plugin)
     try:

@@ -23,28 +23,38 @@ import numpy as np
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import damaged, looks_like, read_bytes, shown
+from advsearch.scene.importing.files import (
+    damaged,
+    describe_content,
+    format_name,
+    read_bytes,
+)
 from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.pictures import (
     TEXTURE_LIMIT,
-    banded_average,
-    read_picture,
+    average_in_bands,
+    read_image,
 )
-from advsearch.scene.library import SUFFIXES as RADIANCE
+from advsearch.scene.library import ENVIRONMENT_SUFFIXES as RADIANCE
 from advsearch.scene.library import import_environment, read_light
-from advsearch.scene.mitsuba_backend.meshes import with_inner
-from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, fewer_warnings, mi
+from advsearch.scene.mitsuba_backend.meshes import map_inner_plugins
+from advsearch.scene.mitsuba_backend.variant import (
+    VARIANT,
+    Plugin,
+    mi,
+    suppress_warnings,
+)
 from advsearch.trust.named_files import References, is_inside
 from advsearch.trust.stored_files import note_opened, scaled, too_large
 
 SUFFIX = ".xml"
-LARGEST = 1 << 24  # bytes of a file, and of all that it includes
-MOST_ELEMENTS = 50_000
-DEEPEST = 40
-MOST_INCLUDED = 50
-LONGEST = 10_000  # letters of a text with the values of its `$names`
+MAX_BYTES = 1 << 24  # bytes of a file, and of all that it includes
+MAX_ELEMENTS = 50_000
+MAX_NESTING = 40
+MAX_INCLUDES = 50
+MAX_TEXT_LENGTH = 10_000  # letters of a text with the values of its `$names`
 # elements that are not named like their type
-TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}
+TYPE_TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}
 _ERROR_LINE = re.compile(
     r"^\[.*?\] Error while loading string \(line (\d+), col \d+\): ", re.DOTALL
 )
@@ -58,20 +68,20 @@ def read_scene(path: Path) -> Plugin:
     Raises:
         FileFormatError: it is missing, corrupt, too large, or no Mitsuba scene.
     """
-    text = _Text(path, References(path))
-    root = text.parsed(read_bytes(path, "scene", (SUFFIX,)))
+    text = _SceneText(path, References(path))
+    root = text.parse(read_bytes(path, "scene", (SUFFIX,)))
     if root.tag != "scene":
         raise damaged(
             path,
             "a Mitsuba scene, which begins with <scene version=...>",
-            f"<{shown(root.tag)}>",
+            f"<{format_name(root.tag)}>",
         )
-    text.fill(root)
+    text.fill_element(root)
     root.set("version", "3.0.0")
     config = mi.parser.ParserConfig(VARIANT)
     config.unused_parameters = mi.LogLevel.Debug
     try:
-        with fewer_warnings():
+        with suppress_warnings():
             state = mi.parser.parse_string(
                 config, ElementTree.tostring(root, encoding="unicode")
             )
@@ -80,22 +90,22 @@ def read_scene(path: Path) -> Plugin:
         where = ""
         # lines are the file's as long as nothing is included
         if position and not text.included:
-            where = f"line {int(position[1]) + text.above}: "
+            where = f"line {int(position[1]) + text.lines_before}: "
         raise FileFormatError(
             f"{path}: {where}{_ERROR_LINE.sub('', str(error))}; correct it"
         ) from error
     referred: set[str] = set()
-    scene = _plugin(path, state, 0, referred)
+    scene = _convert_plugin(path, state, 0, referred)
     # plugins with ids that stand within others, to which the rest of the file may refer
     for name in sorted(referred):
         if _plain_name(name) not in scene and name in state.id_to_index:
             index = state.id_to_index[name]
-            scene[_plain_name(name)] = _plugin(path, state, index, set())
+            scene[_plain_name(name)] = _convert_plugin(path, state, index, set())
     return scene
 
 
 @dataclass
-class _Text:
+class _SceneText:
     """The text of a scene file and of the files that it includes."""
 
     path: Path
@@ -104,18 +114,18 @@ class _Text:
     size: int = 0  # bytes so far
     elements: int = 0
     included: int = 0  # files
-    above: int = 0  # lines before the scene's first one
+    lines_before: int = 0  # lines before the scene's first one
 
-    def parsed(self, data: bytes) -> ElementTree.Element:
+    def parse(self, data: bytes) -> ElementTree.Element:
         """Return the tree of a file.
 
         Comments and blanks are included, so that lines stay the same.
         """
         self.size += len(data)
-        if self.size > scaled(LARGEST):
+        if self.size > scaled(MAX_BYTES):
             raise too_large(
                 self.path,
-                f"a scene of at most {scaled(LARGEST):,} bytes",
+                f"a scene of at most {scaled(MAX_BYTES):,} bytes",
                 f"{self.size:,}",
             )
         parser = expat.ParserCreate()
@@ -124,7 +134,7 @@ class _Text:
         try:
             parser.Parse(data, True)
         except expat.ExpatError as error:
-            got = looks_like(data)
+            got = describe_content(data)
             if data.lstrip().startswith(b"<"):
                 message = expat.errors.messages[error.code]
                 got = f"{message} in line {error.lineno}"
@@ -134,14 +144,14 @@ class _Text:
             raise damaged(
                 self.path,
                 "an XML file",
-                f"one in an unknown encoding ({shown(str(error))})",
+                f"one in an unknown encoding ({format_name(str(error))})",
             ) from error
         root = tree.close()
         version = root.get("version", "3.0.0")
         if root.tag == "scene" and not re.match(r"[23]\.", version):
             raise FileFormatError(
                 f"{self.path}: expected a scene of Mitsuba 2 or 3, got version "
-                f"{shown(version)}; convert it"
+                f"{format_name(version)}; convert it"
             )
         return root
 
@@ -160,11 +170,11 @@ class _Text:
         def start(tag: str, attributes: dict[str, str]) -> None:
             nonlocal depth
             if not self.elements:
-                self.above = parser.CurrentLineNumber - 1
+                self.lines_before = parser.CurrentLineNumber - 1
             depth += 1
             self.elements += 1
-            if self.elements > scaled(MOST_ELEMENTS) or depth > DEEPEST:
-                limit = f"at most {scaled(MOST_ELEMENTS):,} elements, {DEEPEST} deep"
+            if self.elements > scaled(MAX_ELEMENTS) or depth > MAX_NESTING:
+                limit = f"at most {scaled(MAX_ELEMENTS):,} elements, {MAX_NESTING} deep"
                 raise FileFormatError(
                     f"{self.path}: expected {limit}, got more; split the scene up"
                 )
@@ -186,75 +196,75 @@ class _Text:
         parser.CharacterDataHandler = lambda text: tree.data(text) if depth else None
         parser.CommentHandler = lambda text: tree.comment(text) if depth else None
 
-    def fill(self, element: ElementTree.Element) -> None:
+    def fill_element(self, element: ElementTree.Element) -> None:
         """Replace `$names` by their values and includes by the files' elements."""
         children: list[ElementTree.Element] = []
         for child in element:
             for key, text in child.items():
-                child.set(key, self.filled(text))
+                child.set(key, self.fill_text(text))
             if child.tag == "default":
                 self.values.setdefault(child.get("name", ""), child.get("value", ""))
             if child.tag == "include":
                 children += self._include(child.get("filename", ""))
             else:
-                self.fill(child)
+                self.fill_element(child)
                 children.append(child)
         element[:] = children
 
     def _include(self, name: str) -> list[ElementTree.Element]:
         """Return the elements of another file."""
         self.included += 1
-        if self.included > MOST_INCLUDED:
+        if self.included > MAX_INCLUDES:
             raise FileFormatError(
-                f"{self.path}: includes more than {MOST_INCLUDED} files; does one "
+                f"{self.path}: includes more than {MAX_INCLUDES} files; does one "
                 "include itself?"
             )
         try:
-            root = self.parsed(self.references.get(name))
+            root = self.parse(self.references.get(name))
         except FileNotFoundError:
             reason = next(reversed(self.references.refused.values()))
             raise FileFormatError(
-                f"{self.path}: includes {shown(name)}, which {reason}"
+                f"{self.path}: includes {format_name(name)}, which {reason}"
             ) from None
         if root.tag != "scene":
             single = root
             root = ElementTree.Element("scene")
             root.append(single)
-        self.fill(root)
+        self.fill_element(root)
         return list(root)
 
-    def filled(self, text: str) -> str:
+    def fill_text(self, text: str) -> str:
         """Replace the `$names` in a text by their values."""
         result = ""
         # of the pieces, every second one is a name
         for index, piece in enumerate(re.split(r"\$(\w+)", text)):
             is_name = index % 2 == 1
             if is_name and piece not in self.values:
-                name = shown(piece, quoted=False)
+                name = format_name(piece, quoted=False)
                 raise FileFormatError(
                     f"{self.path}: ${name} has no value: no <default> has that name"
                 )
             result += self.values[piece] if is_name else piece
             # a <default> may name others twice, and so on
-            if index and len(result) > LONGEST:
-                limit = f"expected at most {LONGEST:,} letters, got more"
+            if index and len(result) > MAX_TEXT_LENGTH:
+                limit = f"expected at most {MAX_TEXT_LENGTH:,} letters, got more"
                 raise FileFormatError(
-                    f"{self.path}: {shown(text)}: {limit}; write the value out"
+                    f"{self.path}: {format_name(text)}: {limit}; write the value out"
                 )
         return result
 
 
-def _plugin(path: Path, state: Any, number: int, referred: set[str]) -> Plugin:
+def _convert_plugin(path: Path, state: Any, index: int, referred: set[str]) -> Plugin:
     """Return a parsed plugin with all in it, as `mitsuba.load_dict` takes it.
 
     Args:
         path: of the file, for errors.
         state: what Mitsuba's parser returns.
-        number: index of the plugin in it; 0 is the scene.
+        index: index of the plugin in it; 0 is the scene.
         referred: is extended by the ids that the plugin refers to.
     """
     kinds = mi.Properties.Type
-    props = state.nodes[number].props
+    props = state.nodes[index].props
     entries: Plugin = {"type": props.plugin_name()}
     last_suffix: dict[str, int] = {}
 
@@ -274,18 +284,25 @@ def _plugin(path: Path, state: Any, number: int, referred: set[str]) -> Plugin:
         argument = "" if key.startswith("_arg_") else key
         if kind == kinds.ResolvedReference:
             node = state.nodes[value.index()]
-            name = _name_of_node(node, argument, at_top=number == 0)
-            put(_plain_name(name), _plugin(path, state, value.index(), referred))
+            name = _get_node_name(node, argument, at_top=index == 0)
+            put(
+                _plain_name(name), _convert_plugin(path, state, value.index(), referred)
+            )
         elif kind == kinds.Reference:
             referred.add(str(value.id()))
             reference = {"type": "ref", "id": _plain_name(str(value.id()))}
             put(argument or "ref", reference)
         else:
-            put(key, _value(f"{path}: {shown(key, quoted=False)}", kind, value))
+            put(
+                key,
+                _convert_value(
+                    f"{path}: {format_name(key, quoted=False)}", kind, value
+                ),
+            )
     return entries
 
 
-def _name_of_node(node: Any, argument: str, *, at_top: bool) -> str:
+def _get_node_name(node: Any, argument: str, *, at_top: bool) -> str:
     """Return the name of an inner plugin: its id, its argument's name, or its kind.
 
     At the top of a scene the id comes first, elsewhere the argument.
@@ -293,11 +310,11 @@ def _name_of_node(node: Any, argument: str, *, at_top: bool) -> str:
     node_id = str(node.props.id())
     if at_top:
         return node_id or argument or str(node.props.plugin_name())
-    tag = TAGS.get(node.type.name, node.type.name.lower())
+    tag = TYPE_TAGS.get(node.type.name, node.type.name.lower())
     return argument or node_id or tag
 
 
-def _value(where: str, kind: Any, value: Any) -> object:
+def _convert_value(where: str, kind: Any, value: Any) -> object:
     """Return a number, a string, a color or a transform.
 
     Numbers are finite and in float32's range; `where` is for errors.
@@ -319,7 +336,7 @@ def _value(where: str, kind: Any, value: Any) -> object:
     if not (np.abs(np.asarray(numbers, np.float64)) < 1e30).all():
         raise FileFormatError(
             f"{where}: expected a finite number, got "
-            f"{shown(str(np.asarray(numbers)))}; correct it"
+            f"{format_name(str(np.asarray(numbers)))}; correct it"
         )
     if kind == kinds.Transform and not abs(np.linalg.det(numbers[:3, :3])) > 0.0:
         raise FileFormatError(
@@ -339,25 +356,25 @@ def _plain_name(name: str) -> str:
     return name.replace(".", "_")
 
 
-SHAPES = frozenset(
+SHAPE_TYPES = frozenset(
     "rectangle cube sphere cylinder disk obj ply serialized instance shapegroup "
     "sdfgrid bsplinecurve linearcurve "
     "ellipsoids ellipsoidsmesh merge".split()
 )
-LIGHTS = frozenset(
+LIGHT_TYPES = frozenset(
     "constant envmap point spot directional projector sunsky "
     "timed_sunsky area directionalarea".split()
 )
-SENSORS = frozenset(
+SENSOR_TYPES = frozenset(
     "perspective thinlens orthographic radiancemeter irradiancemeter "
     "distant batch".split()
 )
-INTEGRATORS = frozenset(
+INTEGRATOR_TYPES = frozenset(
     "path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov "
     "ptracer depth moment stokes".split()
 )
-MEDIA = frozenset(("homogeneous", "heterogeneous"))
-OTHERS = frozenset(
+MEDIUM_TYPES = frozenset(("homogeneous", "heterogeneous"))
+OTHER_PLUGINS = frozenset(
     """
     bitmap blackbody blendbsdf blendphase box bumpmap catmullrom checkerboard circular
     conductor constvolume d65 dielectric diffuse gaussian gridvolume hair hdrfilm hg
@@ -368,11 +385,20 @@ OTHERS = frozenset(
     tent thindielectric twosided uniform volume
     """.split()
 )
-STOCK = (SHAPES | LIGHTS | SENSORS | INTEGRATORS | MEDIA | OTHERS) - {"merge"}
+STOCK_PLUGINS = (
+    SHAPE_TYPES
+    | LIGHT_TYPES
+    | SENSOR_TYPES
+    | INTEGRATOR_TYPES
+    | MEDIUM_TYPES
+    | OTHER_PLUGINS
+) - {"merge"}
 """The plugins that come with Mitsuba 3.9, but for `measured` and `merge`."""
 
 
-def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin:
+def check_and_read_files(
+    path: Path, scene: Mapping[str, object], notes: list[str]
+) -> Plugin:
     """Return a file's dictionary with images read and full names of checked meshes.
 
     Args:
@@ -405,17 +431,17 @@ class _FileReader:
     def check(self, plugin: Mapping[str, object]) -> Plugin:
         """Return a plugin with all in it checked and read."""
         kind = str(plugin["type"])
-        if kind not in STOCK:
+        if kind not in STOCK_PLUGINS:
             raise FileFormatError(
-                f"{self._path}: {shown(kind)} is no plugin that comes with Mitsuba; "
+                f"{self._path}: {format_name(kind)} is no plugin that comes with Mitsuba; "
                 "leave it out of the file"
             )
         if not re.fullmatch(r"\w*", str(plugin.get("material", ""))):
             raise FileFormatError(
-                f"{self._path}: {shown(str(plugin['material']))} is no name of a "
+                f"{self._path}: {format_name(str(plugin['material']))} is no name of a "
                 "material"
             )
-        entries = with_inner(plugin, self.check)
+        entries = map_inner_plugins(plugin, self.check)
         # without one Mitsuba's bitmap ends the process
         if kind in self._readers and "filename" not in entries:
             raise FileFormatError(
@@ -425,7 +451,7 @@ class _FileReader:
         if "filename" not in entries:
             return entries
         if kind not in self._readers:
-            filename = shown(str(entries["filename"]))
+            filename = format_name(str(entries["filename"]))
             raise FileFormatError(
                 f"{self._path}: {kind} names the file {filename}, which only Mitsuba "
                 "reads, without checks; convert it to "
@@ -442,7 +468,7 @@ class _FileReader:
             refused = self._references.refused
             reason = refused.get(next(reversed(refused)), "is missing")
             raise FileFormatError(
-                f"{self._path}: {kind} needs {shown(str(name))}, which {reason}"
+                f"{self._path}: {kind} needs {format_name(str(name))}, which {reason}"
             ) from None
         directory = self._path.parent
         for candidate in (str(name), os.path.basename(str(name))):
@@ -451,7 +477,7 @@ class _FileReader:
                 note_opened(file)
                 return file
         raise FileFormatError(
-            f"{self._path}: {kind} needs {shown(str(name))}; write its "
+            f"{self._path}: {kind} needs {format_name(str(name))}; write its "
             "name as it is in the folder"
         )
 
@@ -461,7 +487,7 @@ class _FileReader:
         if file.suffix.lower() != f".{plugin['type']}":
             raise FileFormatError(
                 f"{self._path}: expected a .{plugin['type']} file, got "
-                f"{shown(file.name)}; rename it"
+                f"{format_name(file.name)}; rename it"
             )
         read_parts(file, file.read_bytes())
         return {**plugin, "filename": str(file)}
@@ -471,7 +497,7 @@ class _FileReader:
         file = self._find_file("a texture", plugin.pop("filename"))
         if file.suffix.lower() not in RADIANCE:
             is_raw = bool(plugin.get("raw"))
-            image = read_picture(file, raw=is_raw)
+            image = read_image(file, is_raw=is_raw)
             if not is_raw:
                 image = srgb_to_linear(image)
             return {**plugin, "bitmap": image, "raw": True}
@@ -480,17 +506,17 @@ class _FileReader:
         height, width = light.size
         scale = min(1.0, TEXTURE_LIMIT / max(light.size))
         if scale == 1.0:
-            linear = light.band(0, height)
+            linear = light.read_rows(0, height)
         else:
             smaller = (max(1, round(height * scale)), max(1, round(width * scale)))
-            linear = banded_average(light.band, light.size, smaller)
+            linear = average_in_bands(light.read_rows, light.size, smaller)
         return {**plugin, "bitmap": linear, "raw": True}
 
     def _read_envmap(self, plugin: Plugin) -> Plugin:
         """Read an environment as linear values."""
         file = self._find_file("a light", plugin.pop("filename"))
         if file.suffix.lower() not in RADIANCE:
-            image = np.asarray(srgb_to_linear(read_picture(file)), np.float32)
+            image = np.asarray(srgb_to_linear(read_image(file)), np.float32)
             return {**plugin, "bitmap": image}
         environment = import_environment(file)
         self._notes.extend(environment.warnings)

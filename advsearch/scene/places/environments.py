@@ -11,17 +11,17 @@ import torch
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.grounds import LUMINANCE, irradiance
-from advsearch.scene.importing.files import safe_name
+from advsearch.scene.grounds import LUMINANCE, compute_irradiance
+from advsearch.scene.importing.files import make_safe_name
 from advsearch.scene.library import (
     import_environment,
     list_environments,
     load_environment,
 )
 from advsearch.scene.places.place_file import (
-    find_beside,
     read_place,
     read_place_file,
+    resolve_sibling_path,
     split_light,
 )
 from advsearch.trust.stored_files import reading
@@ -55,12 +55,12 @@ def import_place(spec: str) -> EnvironmentAsset:
         if light.map in list_environments():
             lit = load_environment(light.map)
         else:
-            lit = import_environment(find_beside(path, light.map))
+            lit = import_environment(resolve_sibling_path(path, light.map))
     candelas = None
     if light.lux is not None:
-        arriving = irradiance(torch.from_numpy(lit.radiance.copy())) @ torch.tensor(
-            LUMINANCE
-        )
+        arriving = compute_irradiance(
+            torch.from_numpy(lit.radiance.copy())
+        ) @ torch.tensor(LUMINANCE)
         if float(arriving) <= 0.0:
             raise InputError(
                 f"{path}: lights.{light_name}: expected a map with light for its lux, "
@@ -72,7 +72,7 @@ def import_place(spec: str) -> EnvironmentAsset:
         lit,
         name=place.name
         if requested_light is None
-        else safe_name(Path(f"{place.name}-{light_name}.x")),
+        else make_safe_name(Path(f"{place.name}-{light_name}.x")),
         source=spec,
         warnings=(*lit.warnings, *place.notes),
         photographed=False,

@@ -29,7 +29,7 @@ from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError, UnknownNameError
 from advsearch.scene.footprint import Footprint, Solid
-from advsearch.scene.importing.files import safe_name, shown
+from advsearch.scene.importing.files import format_name, make_safe_name
 from advsearch.scene.parts import MeshPart, Place
 from advsearch.scene.places.place_meshes import read_place_meshes
 from advsearch.scene.places.schema import PlaceFile
@@ -83,14 +83,14 @@ def read_place_file(path: Path) -> PlaceFile:
         return PlaceFile.model_validate(content)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
-        where = shown(".".join(map(str, first["loc"])), quoted=False)
+        where = format_name(".".join(map(str, first["loc"])), quoted=False)
         problem = first["msg"].removeprefix("Value error, ")[:200]
         raise FileFormatError(
             f"{path}: {where or 'the file'}: {problem}; docs/scenes.md has an example"
         ) from None
 
 
-def find_beside(path: Path, name: str) -> Path:
+def resolve_sibling_path(path: Path, name: str) -> Path:
     """Return a file that the file of a place names.
 
     Raises FileFormatError: it leads out of the folder.
@@ -110,7 +110,7 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
         FileFormatError, InputError: as for an imported object.
         UnknownNameError: it has no such mesh or variant.
     """
-    parts, notes = read_place_meshes(find_beside(path, file.mesh), variant)
+    parts, notes = read_place_meshes(resolve_sibling_path(path, file.mesh), variant)
     names = [part.name for part in parts]
     for kind in (file.ground, file.lamps):
         for name in kind:
@@ -132,7 +132,10 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
         for index, part in enumerate(parts)
     ]
     return Place(
-        safe_name(Path(os.path.abspath(path)).parent), file, tuple(marked), tuple(notes)
+        make_safe_name(Path(os.path.abspath(path)).parent),
+        file,
+        tuple(marked),
+        tuple(notes),
     )
 
 
@@ -148,7 +151,7 @@ def load_bundled_place(name: str, variant: str | None = None) -> Place:
 
 
 @lru_cache(maxsize=4)
-def lay_place(
+def make_place_parts(
     place: Place, metres: float, candelas: float | None, *, is_dark: bool
 ) -> tuple[MeshPart, ...]:
     """Return the meshes of a place with lengths in the metres of one object size.

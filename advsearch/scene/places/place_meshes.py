@@ -21,10 +21,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.pictures import without_pillows_limit
-from advsearch.scene.assets import Doubles, Ints, Material, Mesh, face_vectors
+from advsearch.scene.assets import (
+    Float64Array,
+    IntArray,
+    Material,
+    Mesh,
+    compute_area_vectors,
+)
 from advsearch.scene.importing import gltf_skeleton
-from advsearch.scene.importing.files import Names, Notes, check_faces, damaged
-from advsearch.scene.importing.geometry import compute_turn
+from advsearch.scene.importing.files import Notes, UniqueNames, check_faces, damaged
+from advsearch.scene.importing.geometry import compute_rotation
 from advsearch.scene.importing.gltf import GltfFile
 from advsearch.scene.importing.gltf_entries import (
     Entry,
@@ -35,27 +41,27 @@ from advsearch.scene.importing.gltf_entries import (
 )
 from advsearch.scene.importing.gltf_parts import (
     GltfSurfaces,
-    Piece,
-    left_out,
-    read_piece,
+    PrimitiveData,
+    note_left_out,
+    read_primitive,
 )
 from advsearch.scene.importing.parts import (
-    NEUTRAL,
+    NEUTRAL_GREY,
     ImportedPart,
     ImportedSurface,
-    placed,
+    transform_part,
 )
 from advsearch.scene.importing.pictures import LARGEST_SUM
 from advsearch.scene.importing.readers import read_mesh_bytes
-from advsearch.scene.importing.scenes import TAKEN
+from advsearch.scene.importing.scenes import RESERVED_NAMES
 from advsearch.scene.parts import BASE_COLOR, MeshPart
 from advsearch.trust.stored_files import check_most
 
 SUFFIXES = (".glb", ".gltf")
 # longest side of a texture; a facade is larger than what an object wears
 TEXTURE_LIMIT = 8192
-MOST_MESHES = 200
-MOST_TEXELS = 2 * LARGEST_SUM
+MAX_MESHES = 200
+MAX_TEXELS = 2 * LARGEST_SUM
 """Of all materials: a picture that many of them share is small in the file, and a
 texture of each in memory.
 """
@@ -173,7 +179,7 @@ def read_place_meshes(
     variant_index = None if variant is None else _find_variant(path, header, variant)
     with without_pillows_limit(), np.errstate(all="ignore"):
         primitives, surfaces = _read_primitives(file, variant_index, notes)
-    left_out(_without_supported_extensions(header), notes)
+    note_left_out(_without_supported_extensions(header), notes)
     _note_left_out(header, primitives, notes)
     check_faces(path, sum(len(primitive.part.faces) for primitive in primitives))
     groups = _group_by_material(header, primitives)
@@ -182,10 +188,10 @@ def read_place_meshes(
             f"{path}: expected meshes with faces, got none; export triangles"
         )
     _check_materials(path, len(groups))
-    names = Names(TAKEN)
+    names = UniqueNames(RESERVED_NAMES)
     parts = list[MeshPart]()
     for (name, material), members in groups.items():
-        part = _make_part(path, names.free(name), members, surfaces[material])
+        part = _make_part(path, names.make_unique(name), members, surfaces[material])
         parts.append(_with_finish(path, header, material, part))
     return parts, list(notes)
 
@@ -206,15 +212,15 @@ def _note_left_out(
 ) -> None:
     """Note what an object of the file would have, and a place does not."""
     if any(primitive.part.colors is not None for primitive in primitives):
-        notes.say(
+        notes.warn(
             " has colours of vertices, which are left out; paint them into a texture"
         )
     if header.skins or header.animations:
-        notes.say(
+        notes.warn(
             " has skins or animations, which are left out: it is shown as it is stored"
         )
     if any(node.lamp is not None for node in header.nodes):
-        notes.say(
+        notes.warn(
             " has lights, which are left out: name what shines in `lamps`, or "
             "let its material emit light"
         )
@@ -261,7 +267,9 @@ def _read_primitives(
     """
     header = file.header
     posed_meshes = []
-    for node, pose in sorted(gltf_skeleton.poses(header), key=lambda item: item[0]):
+    for node, pose in sorted(
+        gltf_skeleton.iterate_poses(header), key=lambda item: item[0]
+    ):
         mesh = header.nodes[node].mesh
         if mesh is not None:
             posed_meshes.append((mesh, pose))
@@ -273,7 +281,9 @@ def _read_primitives(
         for index, primitive in enumerate(header.meshes[mesh].primitives):
             piece = pieces.get((mesh, index))
             if piece is not None:
-                part = placed(_fit_uvs(piece.part, *fitted[piece.material][1:]), pose)
+                part = transform_part(
+                    _fit_uvs(piece.part, *fitted[piece.material][1:]), pose
+                )
                 primitives.append(
                     PosedPrimitive(primitive.material, piece.material, part)
                 )
@@ -281,7 +291,9 @@ def _read_primitives(
     return primitives, surfaces
 
 
-def _fit_uvs(part: ImportedPart, scale: Doubles, shift: Doubles) -> ImportedPart:
+def _fit_uvs(
+    part: ImportedPart, scale: Float64Array, shift: Float64Array
+) -> ImportedPart:
     """Return a part with its UVs in the texture of its surface, v = 0 at the bottom."""
     uvs = part.uvs
     if uvs is None:
@@ -292,53 +304,53 @@ def _fit_uvs(part: ImportedPart, scale: Doubles, shift: Doubles) -> ImportedPart
 
 def _read_pieces(
     file: GltfFile, meshes: Sequence[int], variant: int | None
-) -> dict[tuple[int, int], Piece]:
+) -> dict[tuple[int, int], PrimitiveData]:
     """Read the primitives of meshes, by the mesh and the index in it.
 
     Those without faces are left out.
     """
     header = file.header
-    pieces: dict[tuple[int, int], Piece] = {}
+    pieces: dict[tuple[int, int], PrimitiveData] = {}
     for mesh in meshes:
         for index, primitive in enumerate(header.meshes[mesh].primitives):
             material = _select_material(file.path, header, primitive, variant)
             varied = primitive.model_copy(update={"material": material})
-            piece = read_piece(file, varied, header.meshes[mesh].extras, False)
+            piece = read_primitive(file, varied, header.meshes[mesh].extras, False)
             if piece is not None and len(piece.part.faces):
                 pieces[mesh, index] = piece
     return pieces
 
 
 def _fit_surfaces(
-    file: GltfFile, pieces: Mapping[tuple[int, int], Piece], notes: Notes
-) -> dict[int | None, tuple[ImportedSurface, Doubles, Doubles]]:
+    file: GltfFile, pieces: Mapping[tuple[int, int], PrimitiveData], notes: Notes
+) -> dict[int | None, tuple[ImportedSurface, Float64Array, Float64Array]]:
     """Return the surface of each material, with the scale and shift of its UVs.
 
     Raises FileFormatError, InputError: there are too many materials or texels.
     """
-    by_material: dict[int | None, list[Piece]] = {}
+    by_material: dict[int | None, list[PrimitiveData]] = {}
     for piece in pieces.values():
         by_material.setdefault(piece.material, []).append(piece)
     _check_materials(file.path, len(by_material))
     surfaces = GltfSurfaces(file, notes, TEXTURE_LIMIT)
-    fitted: dict[int | None, tuple[ImportedSurface, Doubles, Doubles]] = {}
+    fitted: dict[int | None, tuple[ImportedSurface, Float64Array, Float64Array]] = {}
     texels = 0
     for material, members in by_material.items():
-        fitted[material] = surfaces.surface(material, members)
+        fitted[material] = surfaces.make_surface(material, members)
         texels += _count_texels(fitted[material][0])
         check_most(
             file.path,
             texels,
-            MOST_TEXELS,
+            MAX_TEXELS,
             "textures of at most {} texels, counted for each material",
         )
     return fitted
 
 
 def _check_materials(path: Path, count: int) -> None:
-    if count > MOST_MESHES:
+    if count > MAX_MESHES:
         raise InputError(
-            f"{path}: expected at most {MOST_MESHES} materials, got "
+            f"{path}: expected at most {MAX_MESHES} materials, got "
             f"{count}; join some of them"
         )
 
@@ -388,7 +400,9 @@ def _make_part(
     path: Path, name: str, members: Sequence[ImportedPart], surface: ImportedSurface
 ) -> MeshPart:
     """Return one mesh of a place from its parts and their surface."""
-    color = np.full(3, NEUTRAL, np.float32) if surface.color is None else surface.color
+    color = (
+        np.full(3, NEUTRAL_GREY, np.float32) if surface.color is None else surface.color
+    )
     base = (
         np.broadcast_to(color, (2, 2, len(color)))
         if surface.texture is None
@@ -439,11 +453,11 @@ def _with_finish(
 
 def _join(members: Sequence[ImportedPart]) -> Mesh:
     """Join parts of a file to one mesh, z up, its front along +x."""
-    turn = compute_turn("y", "+z")
-    vertices = list[Doubles]()
-    faces = list[Ints]()
-    normals = list[Doubles]()
-    uvs = list[Doubles]()
+    turn = compute_rotation("y", "+z")
+    vertices = list[Float64Array]()
+    faces = list[IntArray]()
+    normals = list[Float64Array]()
+    uvs = list[Float64Array]()
     count = 0
     for part in map(_with_normals, members):
         part_normals = part.normals
@@ -472,7 +486,7 @@ def _with_normals(part: ImportedPart) -> ImportedPart:
     if part.normals is not None:
         return part
     corners = part.vertices[part.faces]
-    normals = np.repeat(face_vectors(corners), 3, axis=0)
+    normals = np.repeat(compute_area_vectors(corners), 3, axis=0)
     uvs = None if part.uvs is None else part.uvs[part.faces].reshape(-1, 2)
     faces = np.arange(len(normals)).reshape(-1, 3)
     return replace(

@@ -7,18 +7,18 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from advsearch.scene.assets import Doubles
+from advsearch.scene.assets import Float64Array
 from advsearch.scene.footprint import Footprint
 
-MOST_SOLIDS = 2000  # outlines of a place
-CORNERS = 8  # of the outline of what is round
-FARTHEST = 1e5  # largest length, metres
+MAX_SOLIDS = 2000  # outlines of a place
+N_CIRCLE_CORNERS = 8  # of the outline of what is round
+MAX_LENGTH = 1e5  # largest length, metres
 
 Length = Annotated[
-    float, Field(strict=True, ge=-FARTHEST, le=FARTHEST, allow_inf_nan=False)
+    float, Field(strict=True, ge=-MAX_LENGTH, le=MAX_LENGTH, allow_inf_nan=False)
 ]
 Positive = Annotated[
-    float, Field(strict=True, gt=0.0, le=FARTHEST, allow_inf_nan=False)
+    float, Field(strict=True, gt=0.0, le=MAX_LENGTH, allow_inf_nan=False)
 ]
 Luminance = Annotated[float, Field(strict=True, ge=0.0, le=1e9, allow_inf_nan=False)]
 Illuminance = Annotated[float, Field(strict=True, gt=0.0, le=1e9, allow_inf_nan=False)]
@@ -30,7 +30,7 @@ class _Entry(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-def _is_convex(corners: Doubles) -> bool:
+def _is_convex(corners: Float64Array) -> bool:
     """Return whether corners (K, 2), in turn, turn to one side only, and hold an area."""
     edges = np.roll(corners, -1, axis=0) - corners
     turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
@@ -55,7 +55,7 @@ class SolidEntry(_Entry):
     ) = None
     at: (
         Annotated[
-            list[tuple[Length, Length]], Field(min_length=1, max_length=MOST_SOLIDS)
+            list[tuple[Length, Length]], Field(min_length=1, max_length=MAX_SOLIDS)
         ]
         | None
     ) = None
@@ -88,7 +88,7 @@ class SolidEntry(_Entry):
         """Return the outlines, in metres."""
         if self.outline is not None:
             return [Footprint(np.array(self.outline), *self.heights)]
-        turn = np.arange(CORNERS) * (2.0 * np.pi / CORNERS)
+        turn = np.arange(N_CIRCLE_CORNERS) * (2.0 * np.pi / N_CIRCLE_CORNERS)
         circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
         return [
             Footprint(np.array(center) + (self.radius or 0.0) * circle, *self.heights)
@@ -158,6 +158,6 @@ class PlaceFile(_Entry):
     """Luminance in cd/m2, for each colour channel, of meshes that shine when it is
     dark, and only then.
     """
-    solids: Annotated[list[SolidEntry], Field(max_length=MOST_SOLIDS)] = []
+    solids: Annotated[list[SolidEntry], Field(max_length=MAX_SOLIDS)] = []
     valid: ValidEntry = ValidEntry()
     picture: PictureEntry | None = None  # None: nothing near is in the maps alone

@@ -25,34 +25,40 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.assets import Bools, Floats
+from advsearch.scene.assembly import IMAGE_INPUTS
+from advsearch.scene.assets import BoolArray, Float32Array
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT
-from advsearch.scene.grounds import irradiance as unshadowed
-from advsearch.scene.mitsuba_backend.surface import RAYS, Lit, Seen, Views, lit_arrays
+from advsearch.scene.grounds import compute_irradiance as unshadowed
+from advsearch.scene.mitsuba_backend.surface import (
+    RAYS_PER_PIXEL,
+    LightMaps,
+    ViewSamples,
+    ViewTracer,
+    make_light_maps,
+)
 from advsearch.scene.mitsuba_backend.texel_rays import (
     Ints,
     Lobes,
     compute_visible_cosines,
     is_visible_from_behind,
-    measured,
+    measure_lobes,
     trace_texel_rays,
     world_to_map,
 )
 from advsearch.scene.predictor import LinearMap
-from advsearch.scene.raster import Charts, rasterised
+from advsearch.scene.raster import Charts, rasterize_charts
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import texels
-from advsearch.scene.transport.matrix import bilinear
+from advsearch.scene.transport.matrix import find_bilinear_weights
 
 
 class SurfaceView:
     """What one of several cameras sees.
 
     Attributes:
-        rest: (H, W, 3) radiance that does not come from the matrix.
-        covered: (H, W, 1) fraction of each pixel that surfaces cover.
+        base_radiance: (H, W, 3) radiance that does not come from the matrix.
+        coverage: (H, W, 1) fraction of each pixel that surfaces cover.
         matrix: sparse, from the fine grid to the pixels; from its front and then, if
             there are 2 sides with light of their own, from its back.
 
@@ -64,34 +70,42 @@ class SurfaceView:
     """
 
     def __init__(
-        self, seen: Seen, number: int, shape: tuple[int, int], sides: int = 1
+        self,
+        samples: ViewSamples,
+        camera_index: int,
+        shape: tuple[int, int],
+        sides: int = 1,
     ) -> None:
-        self.rest = seen.rest[number]
-        self.covered = seen.covered[number]
-        height, width = self.rest.shape[:2]
+        self.base_radiance = samples.radiance[camera_index]
+        self.coverage = samples.coverage[camera_index]
+        height, width = self.base_radiance.shape[:2]
         n_cells = shape[0] * shape[1]
-        first_sample = number * height * width * RAYS
-        bounds = torch.tensor([number, number + 1]) * (height * width * RAYS)
-        begin, end = torch.searchsorted(seen.sample, bounds).tolist()
-        pixel = (seen.sample[begin:end] - first_sample) // RAYS
-        columns, fractions = bilinear(seen.uv[begin:end].numpy(), shape)
-        is_back = seen.back[begin:end].numpy()
+        first_sample = camera_index * height * width * RAYS_PER_PIXEL
+        bounds = torch.tensor([camera_index, camera_index + 1]) * (
+            height * width * RAYS_PER_PIXEL
+        )
+        begin, end = torch.searchsorted(samples.sample, bounds).tolist()
+        pixel = (samples.sample[begin:end] - first_sample) // RAYS_PER_PIXEL
+        columns, fractions = find_bilinear_weights(samples.uv[begin:end].numpy(), shape)
+        is_back = samples.is_back[begin:end].numpy()
         columns += np.int32(n_cells) * is_back[:, None]
-        weights = fractions * seen.weight[begin:end].numpy()[:, None]
+        weights = fractions * samples.weight[begin:end].numpy()[:, None]
         row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
         entries = weights.ravel(), columns.ravel(), row_starts.astype(np.int32)
         size = height * width, sides * n_cells
         self.matrix = scipy.sparse.csr_matrix(entries, size, copy=False)
 
-    def radiance(self, reflected: Tensor) -> Tensor:
+    def compute_radiance(self, reflected: Tensor) -> Tensor:
         """Return the radiance (H, W, 3) for what the fine grid reflects.
 
         That is (sides x cells, 3); the result is differentiable in it.
         """
-        return self.rest + product(self.matrix, reflected).reshape(self.rest.shape)
+        return self.base_radiance + multiply_sparse(self.matrix, reflected).reshape(
+            self.base_radiance.shape
+        )
 
 
-def product(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
+def multiply_sparse(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
     """Return a sparse matrix times columns (k, 3); differentiable in these."""
 
     def multiply(factor: scipy.sparse.csr_matrix, values: Tensor) -> Tensor:
@@ -103,44 +117,50 @@ def product(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
     return rows
 
 
-SIDE = 160  # texels along each side of the searched object's texture
-GATHERED = 256  # rays from each texel by which it is known what it sees
+OBJECT_TEXELS = 160  # texels along each side of the searched object's texture
+RAYS_PER_TEXEL = 256  # rays from each texel by which it is known what it sees
 # fraction of a texel's rays that meet the back of a surface above which it lies inside
 # something
-BURIED = 0.3
+BURIED_FRACTION = 0.3
 BOUNCES = 4
 """How often light goes from texel to texel.
 
 With the camera's and the sky's segments that makes a path of `MAX_DEPTH`.
 """
-FINE = 192  # smallest width of the grid on which base color and light are multiplied
+MIN_FINE_SIZE = (
+    192  # smallest width of the grid on which base color and light are multiplied
+)
 # largest reflectance of a photographed ground, where light goes from surface to surface
-WHITE = 0.95
-COLOR = f"{OBJECT}.base_color"
-MAP = "environment.padded"
-GROUND = "ground"
-CAMERAS = frozenset(
+MAX_GROUND_REFLECTANCE = 0.95
+COLOR_INPUT = f"{OBJECT}.base_color"
+ENVIRONMENT_INPUT = "environment.padded"
+GROUND_NAME = "ground"
+CAMERA_INPUTS = frozenset(
     {"camera.to_world", "camera.fov", "camera.shift_x", "camera.shift_y"}
 )
-FREE = CAMERAS | ON_PICTURE | {MAP, COLOR, "ground.reflectance"}
+FREE_INPUTS = (
+    CAMERA_INPUTS
+    | IMAGE_INPUTS
+    | {ENVIRONMENT_INPUT, COLOR_INPUT, "ground.reflectance"}
+)
 """Inputs that may change: at most the light has to be computed again."""
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
+class ArrangementLight:
     """Light on the surfaces."""
 
     # (sides x cells of the fine grid, 3) irradiance of the object's front, and then of
     # its back where that has its own
     on_object: Tensor
-    lit: Lit  # all other light, for look-ups
+    maps: LightMaps  # all other light, for look-ups
 
     @property
     def bytes(self) -> int:
         """Memory that it takes."""
-        return 4 * (self.on_object.numel() + self.lit.numbers)
+        return 4 * (self.on_object.numel() + self.maps.size)
 
-    def reflected(self, fine: Tensor) -> Tensor:
+    def compute_reflected(self, fine: Tensor) -> Tensor:
         """Return what a base color (cells of the fine grid, 3) reflects on each side.
 
         The result is differentiable.
@@ -167,85 +187,100 @@ class Arrangement:
     ) -> None:
         scene = renderer.scene
         self._scene = scene
-        self.inputs = {name: inputs[name] for name in inputs if name not in ON_PICTURE}
-        scene.held(self.inputs)
-        description = scene.made[0]
+        self.inputs = {
+            name: inputs[name] for name in inputs if name not in IMAGE_INPUTS
+        }
+        scene.set_inputs(self.inputs)
+        description = scene.definition[0]
         vertices = self._object_buffer("vertices")
         normals = self._object_buffer("normals")
         middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-        charts = rasterised(description.meshes[OBJECT].mesh, SIDE)
+        charts = rasterize_charts(description.meshes[OBJECT].mesh, OBJECT_TEXELS)
         surfaces = self._texels_on_object(charts, vertices, normals)
-        self.sides = len(surfaces)
+        self.n_sides = len(surfaces)
         photograph = description.photograph
         self._has_ground = description.number("ground.size") > 0.0
         if self._has_ground:
             center = (float(middle[0]), float(middle[1]))
             reach = self._ground_reach(photograph is not None)
-            surfaces.append(texels.on_ground(GROUND, 0.0, reach, center))
-        self.texels: texels.LitTexels = texels.together(surfaces)
-        factor = max(1, math.ceil(FINE / min(texture)))
-        self.fine = texture[0] * factor, texture[1] * factor
-        self._finer = _upsampling_matrix(texture, self.fine) if factor > 1 else None
+            surfaces.append(texels.make_ground_texels(GROUND_NAME, 0.0, reach, center))
+        self.texels: texels.LitTexels = texels.join_texels(surfaces)
+        factor = max(1, math.ceil(MIN_FINE_SIZE / min(texture)))
+        self.fine_shape = texture[0] * factor, texture[1] * factor
+        self._finer = (
+            _make_upsampling_matrix(texture, self.fine_shape) if factor > 1 else None
+        )
 
         met_cells = trace_texel_rays(
             scene,
             self.texels.grids,
-            texels.CELLS,
-            self.texels.places,
+            texels.SKY_SHAPE,
+            self.texels.positions,
             self.texels.normals,
-            GATHERED,
+            RAYS_PER_TEXEL,
             seed,
         )
         self._view_matrices = texels.make_view_matrices(
-            met_cells, self.texels.of_cell, len(self.texels.places)
+            met_cells, self.texels.texel_of_cell, len(self.texels.positions)
         )
         self._to_fine = []
-        for side in range(self.sides):
+        for side in range(self.n_sides):
             side_normals = (1 - 2 * side) * normals
             buried = self._find_buried(met_cells, side)
             self._to_fine.append(
-                texels.between(
-                    surfaces[side], charts, self.fine, vertices, side_normals, buried
+                texels.make_lookup_matrix(
+                    surfaces[side],
+                    charts,
+                    self.fine_shape,
+                    vertices,
+                    side_normals,
+                    buried,
                 )
             )
         if self._has_ground:
-            ground_cells = met_cells[self.texels.of(self.sides)]
-            sees_sky = (ground_cells >= len(self.texels.of_cell)).any(axis=1)
-            self._smooth = texels.smoothed(surfaces[-1], np.asarray(sees_sky))
-        self.lobes = [self._measure_object()] * self.sides
-        self.lobes += [Lobes.matt()] * (len(surfaces) - self.sides)
+            ground_cells = met_cells[self.texels.select_grid(self.n_sides)]
+            sees_sky = (ground_cells >= len(self.texels.texel_of_cell)).any(axis=1)
+            self._smooth = texels.make_smoothing_matrix(
+                surfaces[-1], np.asarray(sees_sky)
+            )
+        self.lobes = [self._measure_object()] * self.n_sides
+        self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
         self._photographed = None if photograph is None else description.capture_height
-        self.to_map = torch.tensor(world_to_map(scene), dtype=torch.float32)
+        self.world_to_map = torch.tensor(world_to_map(scene), dtype=torch.float32)
         self._below = self._find_ground_below(middle)
         model = description.camera_model
         if model is not None and "camera.lens" in self.inputs:
             model = model.with_numbers(self.inputs["camera.lens"])
-        self._views = Views(
+        self._views = ViewTracer(
             scene,
             self.texels.grids,
             self.lobes,
-            texels.WIDTHS,
+            texels.BLUR_WIDTHS,
             self._photographed,
             model,
             middle,
         )
 
-    def _object_buffer(self, buffer: str) -> Floats:
+    def _object_buffer(self, buffer: str) -> Float32Array:
         """Return the object's vertices or normals (V, 3)."""
         name = f"{OBJECT}.{buffer}"
-        values = self.inputs[name] if name in self.inputs else self._scene.base(name)
-        rows: Floats = values.reshape(-1, 3).numpy()
+        values = (
+            self.inputs[name]
+            if name in self.inputs
+            else self._scene.get_base_value(name)
+        )
+        rows: Float32Array = values.reshape(-1, 3).numpy()
         return rows
 
     def _texels_on_object(
-        self, charts: Charts, vertices: Floats, normals: Floats
+        self, charts: Charts, vertices: Float32Array, normals: Float32Array
     ) -> list[texels.LitTexels]:
         """Return the texels of the object; of both sides if its back is visible."""
-        single = texels.on_mesh(OBJECT, charts, vertices, normals)
-        if not is_visible_from_behind(self._scene, OBJECT, single.places):
+        single = texels.make_mesh_texels(OBJECT, charts, vertices, normals)
+        if not is_visible_from_behind(self._scene, OBJECT, single.positions):
             return [single]
         return [
-            texels.on_mesh(OBJECT, charts, vertices, side * normals, side)
+            texels.make_mesh_texels(OBJECT, charts, vertices, side * normals, side)
             for side in (1, -1)
         ]
 
@@ -253,26 +288,26 @@ class Arrangement:
         """Return half the width of the ground; a photographed one has no end."""
         if is_photographed:
             return math.inf
-        return self._scene.made[0].number("ground.size") / 2.0
+        return self._scene.definition[0].number("ground.size") / 2.0
 
-    def _find_buried(self, met_cells: Ints, side: int) -> Bools:
+    def _find_buried(self, met_cells: Ints, side: int) -> BoolArray:
         """Return which texels of a side of the object lie inside something.
 
         They see nothing but backs; where backs have light of their own, they see many
         of them and no sky.
         """
-        cells = met_cells[self.texels.of(side)]
-        if self.sides == 1:
-            return np.asarray((cells < 0).mean(axis=1) > BURIED)
+        cells = met_cells[self.texels.select_grid(side)]
+        if self.n_sides == 1:
+            return np.asarray((cells < 0).mean(axis=1) > BURIED_FRACTION)
         back = self.texels.grids[1]
-        is_back = (cells >= back.first) & (cells < back.first + back.count)
-        sees_sky = (cells >= len(self.texels.of_cell)).any(axis=1)
-        return np.asarray((is_back.mean(axis=1) > BURIED) & ~sees_sky)
+        is_back = (cells >= back.first_cell) & (cells < back.first_cell + back.n_cells)
+        sees_sky = (cells >= len(self.texels.texel_of_cell)).any(axis=1)
+        return np.asarray((is_back.mean(axis=1) > BURIED_FRACTION) & ~sees_sky)
 
     def _measure_object(self) -> Lobes:
         """Measure the object's BSDF at one of its most opaque texels."""
-        front = self.texels.of(0)
-        opacity = self._scene.made[0].meshes[OBJECT].opacity
+        front = self.texels.select_grid(0)
+        opacity = self._scene.definition[0].meshes[OBJECT].opacity
         candidates = np.arange(front.start, front.stop)
         if opacity is not None:
             n_rows, n_columns = self.texels.grids[0].shape
@@ -282,31 +317,31 @@ class Arrangement:
             texel_opacity = opacity[opacity_row, opacity_column]
             candidates = candidates[texel_opacity >= texel_opacity.max()]
         texel = candidates[len(candidates) // 2]
-        return measured(
+        return measure_lobes(
             self._scene,
             self.inputs,
             self.texels.grids[0],
-            self.texels.places[texel],
+            self.texels.positions[texel],
             self.texels.normals[texel],
         )
 
-    def _find_ground_below(self, middle: Floats) -> tuple[Tensor, Tensor]:
+    def _find_ground_below(self, middle: Float32Array) -> tuple[Tensor, Tensor]:
         """Find the ground in the blurred maps, seen from the object's center.
 
         Returns:
             (h, w) which cells the ground hides; and (h, w, 3) the directions in the
             map's axes in which its photograph has what is seen there.
         """
-        directions = texels.directions(texels.BLURRED)
-        world = directions @ self.to_map
+        directions = texels.compute_directions(texels.BLURRED_SHAPE)
+        world = directions @ self.world_to_map
         if not self._has_ground:
-            return torch.zeros(texels.BLURRED, dtype=torch.bool), directions
+            return torch.zeros(texels.BLURRED_SHAPE, dtype=torch.bool), directions
         distance = float(middle[2]) / (-world[..., 2]).clamp_min(1e-6)
         points = torch.from_numpy(middle).float() + world * distance[..., None]
         reach = self._ground_reach(self._photographed is not None)
         in_reach = (points[..., :2].abs() <= reach).all(dim=-1)
         camera = torch.tensor([0.0, 0.0, self._photographed or 0.0])
-        from_camera = (points - camera) @ self.to_map.T
+        from_camera = (points - camera) @ self.world_to_map.T
         return (world[..., 2] < -1e-3) & in_reach, from_camera
 
     @property
@@ -320,23 +355,23 @@ class Arrangement:
         """Memory of the matrices."""
         return 8 * self.entries
 
-    def look(
-        self, cameras: Sequence[Mapping[str, Tensor]], light: Light
-    ) -> Callable[[], Seen]:
-        """Start to trace rays through cameras under a light; see `Views`."""
-        self._scene.stand(self.inputs)
-        return self._views(cameras, light.lit)
+    def start_tracing(
+        self, cameras: Sequence[Mapping[str, Tensor]], light: ArrangementLight
+    ) -> Callable[[], ViewSamples]:
+        """Start to trace rays through cameras under a light; see `ViewTracer`."""
+        self._scene.set_geometry(self.inputs)
+        return self._views(cameras, light.maps)
 
-    def view(self, seen: Seen, number: int) -> SurfaceView:
+    def make_view(self, samples: ViewSamples, camera_index: int) -> SurfaceView:
         """Return what the camera with an index sees."""
-        return SurfaceView(seen, number, self.fine, self.sides)
+        return SurfaceView(samples, camera_index, self.fine_shape, self.n_sides)
 
-    def finer(self, color: Tensor) -> Tensor:
+    def upsample(self, color: Tensor) -> Tensor:
         """Return a base color (h, w, 3) on the fine grid, (cells, 3); differentiable."""
         flat = color.reshape(-1, 3)
-        return flat if self._finer is None else product(self._finer, flat)
+        return flat if self._finer is None else multiply_sparse(self._finer, flat)
 
-    def light(self, padded: Tensor, color: Tensor) -> Light:
+    def compute_light(self, padded: Tensor, color: Tensor) -> ArrangementLight:
         """Return the light of an environment, for a base color of the object.
 
         Args:
@@ -344,9 +379,9 @@ class Arrangement:
             color: (h, w, 3).
         """
         with torch.no_grad():
-            sky = texels.sky_of(padded)
+            sky = texels.prepare_sky(padded)
             reflectance = self._reflectance(color, padded)
-            arriving = texels.irradiance(
+            arriving = texels.compute_irradiance(
                 self._view_matrices,
                 sky,
                 self._hot_cosines(sky),
@@ -357,28 +392,28 @@ class Arrangement:
             surroundings = sky.map
             far_ground = torch.ones(1, 3)
             if self._has_ground:
-                ground = self.texels.of(self.sides)
+                ground = self.texels.select_grid(self.n_sides)
                 leaving[ground] = self._leaving_ground(arriving, leaving, padded)
                 far_ground = self._far_ground(leaving[ground])
                 surroundings = self._put_ground(surroundings, far_ground, padded)
             on_sides = [
-                to_fine @ arriving[self.texels.of(side)]
+                to_fine @ arriving[self.texels.select_grid(side)]
                 for side, to_fine in enumerate(self._to_fine)
             ]
-            texel_of_cell = torch.from_numpy(self.texels.of_cell)
+            texel_of_cell = torch.from_numpy(self.texels.texel_of_cell)
             cells = torch.cat([leaving[texel_of_cell], far_ground])
-            lit = lit_arrays(cells, padded, texels.blurred(surroundings))
-            return Light(torch.cat(on_sides), lit)
+            lit = make_light_maps(cells, padded, texels.blur_map(surroundings))
+            return ArrangementLight(torch.cat(on_sides), lit)
 
     def _hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
         """Return the visible cosines (n, k) towards what is hot; None if nothing is."""
         hot_directions = sky.hot[0]
         if not len(hot_directions):
             return None
-        self._scene.stand(self.inputs)
+        self._scene.set_geometry(self.inputs)
         cosines = compute_visible_cosines(
             self._scene,
-            self.texels.places,
+            self.texels.positions,
             self.texels.normals,
             hot_directions.numpy(),
         )
@@ -391,7 +426,7 @@ class Arrangement:
 
         Of a photographed ground it is the fraction of its photograph that it shows.
         """
-        ground = self.texels.of(self.sides)
+        ground = self.texels.select_grid(self.n_sides)
         if self._photographed is None:
             return self._smooth @ leaving[ground]
         full_light = unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
@@ -410,40 +445,40 @@ class Arrangement:
         is_hidden, from_camera = self._below
         ground = far_ground
         if self._photographed is not None:
-            photograph = texels.looked_up(padded, from_camera.reshape(-1, 3))
-            ground = far_ground * photograph.reshape(*texels.BLURRED, 3)
+            photograph = texels.look_up_environment(padded, from_camera.reshape(-1, 3))
+            ground = far_ground * photograph.reshape(*texels.BLURRED_SHAPE, 3)
         return torch.where(is_hidden[..., None], ground, surroundings)
 
     def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
         """Return the reflectance (n, 3) of all texels for even light."""
         n_rows, n_columns = self.texels.grids[0].shape
-        fine = self.finer(color).reshape(*self.fine, 3).permute(2, 0, 1)[None]
+        fine = self.upsample(color).reshape(*self.fine_shape, 3).permute(2, 0, 1)[None]
         pooled = functional.adaptive_avg_pool2d(fine, (n_rows, n_columns))[0]
         pooled = pooled.permute(1, 2, 0).reshape(-1, 3)
-        object_cells = torch.from_numpy(self.texels.cells[self.texels.of(0)])
-        colors = [pooled[object_cells]] * self.sides
+        object_cells = torch.from_numpy(self.texels.cells[self.texels.select_grid(0)])
+        colors = [pooled[object_cells]] * self.n_sides
         if self._has_ground:
             colors.append(self._ground_color(padded))
         reflectances = []
         for surface_color, surface in zip(colors, self.lobes, strict=True):
-            diffuse, gloss = torch.tensor(surface.mean_shares)
+            diffuse, gloss = torch.tensor(surface.mean_reflectances)
             reflectances.append(surface_color * diffuse + gloss)
         return torch.cat(reflectances)
 
     def _ground_color(self, padded: Tensor) -> Tensor:
         """Return the base color (n, 3) of the ground's texels."""
-        ground = self.texels.places[self.texels.of(self.sides)]
+        ground = self.texels.positions[self.texels.select_grid(self.n_sides)]
         if self._photographed is None:
-            srgb = torch.tensor(self._scene.made[0].ground_color)
+            srgb = torch.tensor(self._scene.definition[0].ground_color)
             return srgb_to_linear(srgb).expand(len(ground), 3)
         camera = torch.tensor([0.0, 0.0, self._photographed])
-        directions = (torch.from_numpy(ground) - camera) @ self.to_map.T
-        photograph = texels.looked_up(padded, directions)
+        directions = (torch.from_numpy(ground) - camera) @ self.world_to_map.T
+        photograph = texels.look_up_environment(padded, directions)
         full_light = unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
-        return (photograph * math.pi / full_light).clamp_max(WHITE)
+        return (photograph * math.pi / full_light).clamp_max(MAX_GROUND_REFLECTANCE)
 
 
-def _upsampling_matrix(
+def _make_upsampling_matrix(
     texture: tuple[int, int], fine: tuple[int, int]
 ) -> scipy.sparse.csr_matrix:
     """Return the matrix from the texels of a small texture to the fine grid."""
@@ -454,7 +489,7 @@ def _upsampling_matrix(
         indexing="ij",
     )
     uv = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
-    texel, fractions = bilinear(uv, texture)
+    texel, fractions = find_bilinear_weights(uv, texture)
     row_starts = np.arange(n_rows * n_columns + 1, dtype=np.int32) * 4
     entries = (fractions.ravel(), texel.ravel(), row_starts)
     return scipy.sparse.csr_matrix(

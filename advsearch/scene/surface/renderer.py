@@ -1,6 +1,6 @@
 """Predict images from many cameras and under many environments by light on surfaces.
 
-`why_not` returns why a scene's or a space's images cannot be predicted.
+`find_refusal` returns why a scene's or a space's images cannot be predicted.
 """
 
 from __future__ import annotations
@@ -14,57 +14,59 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.description import OBJECT
-from advsearch.scene.mitsuba_backend.surface import RAYS
+from advsearch.scene.mitsuba_backend.surface import RAYS_PER_PIXEL
 from advsearch.scene.predictor import (
-    BETWEEN,
-    MOST_BYTES,
+    MAX_BYTES,
     NOISE,
+    PROBE_FRACTIONS,
     Predictor,
     Refusal,
     RefusalCause,
-    differs,
+    inputs_differ,
 )
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import (
-    CAMERAS,
-    COLOR,
-    FREE,
-    MAP,
+    CAMERA_INPUTS,
+    COLOR_INPUT,
+    ENVIRONMENT_INPUT,
+    FREE_INPUTS,
     Arrangement,
-    Light,
+    ArrangementLight,
     SurfaceView,
 )
 from advsearch.trust.stored_files import scaled
 
-MOST_RAYS = 1 << 21  # rays of cameras of one launch
-TEXELS = 333  # of an environment's map that are compared with those of others
+MAX_RAYS = 1 << 21  # rays of cameras of one launch
+N_COMPARED_TEXELS = (
+    333  # of an environment's map that are compared with those of others
+)
 
 
-class Look(NamedTuple):
+class LitCameraView(NamedTuple):
     """What one of several cameras sees, and under which light."""
 
-    number: int  # index of the camera
+    camera_index: int  # index of the camera
     view: SurfaceView
-    light: Light
+    light: ArrangementLight
     factor: Tensor | float  # (3,) how many times as bright the light is
 
 
 @dataclass(frozen=True, eq=False)
-class Sketch:
+class MapFingerprint:
     """A fingerprint of an environment's map, for comparison with other maps."""
 
     mean: Tensor  # (3,) of the map
     texels: Tensor  # (n, 3) some of its texels over the means
 
     @classmethod
-    def of(cls, padded: Tensor) -> Sketch:
+    def compute(cls, padded: Tensor) -> MapFingerprint:
         """Return the fingerprint of a map (H, W + 2, 3)."""
         flat = padded.reshape(-1, 3)
         mean = flat.mean(dim=0)
-        step = max(1, len(flat) // TEXELS)
+        step = max(1, len(flat) // N_COMPARED_TEXELS)
         return cls(mean, flat[::step] / mean.clamp_min(1e-12))
 
-    def times(self, other: Sketch) -> Tensor | None:
+    def find_factor(self, other: MapFingerprint) -> Tensor | None:
         """Return how many times as bright (3,) another map is.
 
         None if it differs in more than that.
@@ -77,11 +79,11 @@ class Sketch:
 
 
 class SurfaceRenderer(Predictor):
-    """Predict images by light on surfaces, in spaces that `why_not` does not refuse.
+    """Predict images by light on surfaces, in spaces that `find_refusal` does not refuse.
 
     An image is linear in the base color of the object. Light that goes from the object
-    to itself, or to the ground and back, is that of the base color `there`; see
-    `renew`.
+    to itself, or to the ground and back, is that of the base color `base_color`; see
+    `update_base_color`.
 
     Args:
         traced: renderer of the scene.
@@ -90,125 +92,137 @@ class SurfaceRenderer(Predictor):
         seed: of the rays from texels.
 
     Attributes:
-        there: (h, w, 3) base color.
-        lights_kept: the lights of maps, the oldest first.
-        dropped: how many lights were removed for others.
-        fixed: the light of all images, see `under`; None for that of the image's own
+        base_color: (h, w, 3) base color.
+        stored_lights: the lights of maps, the oldest first.
+        n_dropped: how many lights were removed for others.
+        fixed_light: the light of all images, see `with_fixed_light`; None for that of the image's own
             environment.
     """
 
-    fixed: Light | None = None
-    lights = 0
+    fixed_light: ArrangementLight | None = None
+    n_traced_images = 0
 
     def __init__(self, traced: Renderer, u: Tensor, seed: int) -> None:
         super().__init__(traced)
-        self.dropped = 0
-        self.lights_kept: dict[Sketch, Light] = {}
+        self.n_dropped = 0
+        self.stored_lights: dict[MapFingerprint, ArrangementLight] = {}
         self._base = {
-            name: traced.scene.base(name)
-            for name in (*CAMERAS, MAP, COLOR)
-            if name in traced.scene.names
+            name: traced.scene.get_base_value(name)
+            for name in (*CAMERA_INPUTS, ENVIRONMENT_INPUT, COLOR_INPUT)
+            if name in traced.scene.input_names
         }
-        inputs = self.inputs(u)
-        self.there = self.color(inputs)
-        fixed_inputs = {name: inputs[name] for name in inputs if name not in FREE}
-        texture = (self.there.shape[0], self.there.shape[1])
+        inputs = self.compute_inputs(u)
+        self.base_color = self.get_color(inputs)
+        fixed_inputs = {
+            name: inputs[name] for name in inputs if name not in FREE_INPUTS
+        }
+        texture = (self.base_color.shape[0], self.base_color.shape[1])
         with torch.no_grad():
             self.arrangement = Arrangement(traced, fixed_inputs, texture, seed)
 
-    def inputs(self, u: Tensor) -> dict[str, Tensor]:
+    def compute_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the scene inputs of a configuration (d,), without a graph."""
         with torch.no_grad():
-            return self.traced.scene.assembly(self.traced.space.inputs(u))
+            return self.path_renderer.scene.assembly(self.path_renderer.space.inputs(u))
 
-    def color(self, inputs: Mapping[str, Tensor]) -> Tensor:
+    def get_color(self, inputs: Mapping[str, Tensor]) -> Tensor:
         """Return the base color (h, w, 3) of scene inputs."""
-        return inputs.get(COLOR, self._base[COLOR])
+        return inputs.get(COLOR_INPUT, self._base[COLOR_INPUT])
 
-    def stands(self, inputs: Mapping[str, Tensor]) -> bool:
+    def is_applicable(self, inputs: Mapping[str, Tensor]) -> bool:
         """Return whether only cameras and environment differ in some scene inputs."""
-        expected = {**self.arrangement.inputs, COLOR: self.there}
-        fixed_inputs = {name: inputs[name] for name in inputs if name not in FREE}
-        fixed_inputs[COLOR] = self.color(inputs)
+        expected = {**self.arrangement.inputs, COLOR_INPUT: self.base_color}
+        fixed_inputs = {
+            name: inputs[name] for name in inputs if name not in FREE_INPUTS
+        }
+        fixed_inputs[COLOR_INPUT] = self.get_color(inputs)
         return expected.keys() == fixed_inputs.keys() and not any(
-            differs(expected[name], fixed_inputs[name]) for name in expected
+            inputs_differ(expected[name], fixed_inputs[name]) for name in expected
         )
 
-    def renew(self, u: Tensor) -> None:
+    def update_base_color(self, u: Tensor) -> None:
         """Take the light between surfaces from the base color at u from now on."""
-        self.there = self.color(self.inputs(u))
-        self.lights_kept.clear()
+        self.base_color = self.get_color(self.compute_inputs(u))
+        self.stored_lights.clear()
 
-    def under(self, inputs: Mapping[str, Tensor]) -> SurfaceRenderer:
+    def with_fixed_light(self, inputs: Mapping[str, Tensor]) -> SurfaceRenderer:
         """Return a predictor of images that are all under the environment of inputs."""
         other = copy.copy(self)
-        other.fixed = self.light(inputs)
-        other.lights_kept = {}
+        other.fixed_light = self.compute_light(inputs)
+        other.stored_lights = {}
         return other
 
     @property
-    def at_once(self) -> int:
+    def batch_size(self) -> int:
         """Number of images in one launch."""
-        height, width = self.traced.formation.resolution
-        return max(1, MOST_RAYS // (height * width * RAYS))
+        height, width = self.path_renderer.formation.resolution
+        return max(1, MAX_RAYS // (height * width * RAYS_PER_PIXEL))
 
     @property
-    def entries(self) -> int:
+    def n_entries(self) -> int:
         return self.arrangement.entries
 
     @property
-    def bytes(self) -> int:
-        if self.fixed is not None:  # the rest is shared
-            return self.fixed.bytes
-        lights = sum(light.bytes for light in self.lights_kept.values())
+    def n_bytes(self) -> int:
+        if self.fixed_light is not None:  # the rest is shared
+            return self.fixed_light.bytes
+        lights = sum(light.bytes for light in self.stored_lights.values())
         return self.arrangement.bytes + lights
 
-    def light(self, inputs: Mapping[str, Tensor]) -> Light:
+    def compute_light(self, inputs: Mapping[str, Tensor]) -> ArrangementLight:
         """Compute the light under the environment of scene inputs."""
-        padded = inputs.get(MAP, self._base[MAP]).detach()
-        return self.arrangement.light(padded, self.there)
+        padded = inputs.get(ENVIRONMENT_INPUT, self._base[ENVIRONMENT_INPUT]).detach()
+        return self.arrangement.compute_light(padded, self.base_color)
 
-    def kept_light(self, inputs: Mapping[str, Tensor]) -> tuple[Light, Tensor]:
+    def get_light(
+        self, inputs: Mapping[str, Tensor]
+    ) -> tuple[ArrangementLight, Tensor]:
         """Return the light under the environment of scene inputs, and its factor (3,).
 
         Exposures and tints of one map have one light. It is computed on first use, and
-        up to `MOST_BYTES` of lights are stored.
+        up to `MAX_BYTES` of lights are stored.
         """
-        sketch = Sketch.of(inputs.get(MAP, self._base[MAP]).detach())
-        for stored_sketch, light in self.lights_kept.items():
-            factor = stored_sketch.times(sketch)
+        sketch = MapFingerprint.compute(
+            inputs.get(ENVIRONMENT_INPUT, self._base[ENVIRONMENT_INPUT]).detach()
+        )
+        for stored_sketch, light in self.stored_lights.items():
+            factor = stored_sketch.find_factor(sketch)
             if factor is not None:
                 return light, factor
-        light = self.light(inputs)
-        self.lights_kept[sketch] = light
-        while len(self.lights_kept) > 1 and self.bytes > scaled(MOST_BYTES):
-            oldest = next(iter(self.lights_kept))
-            self.lights_kept.pop(oldest)
-            self.dropped += 1
+        light = self.compute_light(inputs)
+        self.stored_lights[sketch] = light
+        while len(self.stored_lights) > 1 and self.n_bytes > scaled(MAX_BYTES):
+            oldest = next(iter(self.stored_lights))
+            self.stored_lights.pop(oldest)
+            self.n_dropped += 1
         return light, torch.ones(3)
 
-    def looks(self, inputs: Sequence[Mapping[str, Tensor]]) -> Iterator[Look]:
+    def trace_views(
+        self, inputs: Sequence[Mapping[str, Tensor]]
+    ) -> Iterator[LitCameraView]:
         """Yield what the cameras of scene inputs see.
 
         Those under one environment are traced in one launch, while the results of the
         launch before are used.
         """
-        lights: list[tuple[Light, Tensor | float]] = []
+        lights: list[tuple[ArrangementLight, Tensor | float]] = []
         for camera_inputs in inputs:
-            if self.fixed is None:
-                lights.append(self.kept_light(camera_inputs))
+            if self.fixed_light is None:
+                lights.append(self.get_light(camera_inputs))
             else:
-                lights.append((self.fixed, 1.0))
-        cameras_of_light: dict[Light, list[int]] = {}
+                lights.append((self.fixed_light, 1.0))
+        cameras_of_light: dict[ArrangementLight, list[int]] = {}
         for number, (light, _) in enumerate(lights):
             cameras_of_light.setdefault(light, []).append(number)
-        names = CAMERAS & self._base.keys()
+        names = CAMERA_INPUTS & self._base.keys()
         cameras = [
             {name: camera_inputs.get(name, self._base[name]) for name in names}
             for camera_inputs in inputs
         ]
         launches = (
-            self.arrangement.look([cameras[number] for number in numbers], light)
+            self.arrangement.start_tracing(
+                [cameras[number] for number in numbers], light
+            )
             for light, numbers in cameras_of_light.items()
         )
         running = next(launches)
@@ -216,57 +230,63 @@ class SurfaceRenderer(Predictor):
             samples = running()
             running = next(launches, running)
             for index, number in enumerate(numbers):
-                view = self.arrangement.view(samples, index)
-                yield Look(number, view, light, lights[number][1])
+                view = self.arrangement.make_view(samples, index)
+                yield LitCameraView(number, view, light, lights[number][1])
 
-    def shown(
+    def compose_images(
         self,
-        looks: Iterable[Look],
+        views: Iterable[LitCameraView],
         inputs: Sequence[Mapping[str, Tensor]],
         color: Tensor,
-        wholes: Sequence[Tensor],
+        full_configurations: Sequence[Tensor],
     ) -> Tensor:
         """Return the images (n, H, W, 3) sRGB of what cameras see of a base color.
 
         Args:
-            looks: of the cameras.
+            views: of the cameras.
             inputs: scene inputs for each, whose base color is ignored.
             color: (h, w, 3); the images are differentiable in it.
-            wholes: full configurations (d,), for what controls do to the finished
+            full_configurations: full configurations (d,), for what controls do to the finished
                 image.
         """
-        fine = self.arrangement.finer(color)
-        reflected = dict[Light, Tensor]()
+        fine = self.arrangement.upsample(color)
+        reflected = dict[ArrangementLight, Tensor]()
         images = dict[int, Tensor]()
-        for look in looks:
+        for look in views:
             if look.light not in reflected:
-                reflected[look.light] = look.light.reflected(fine)
-            radiance = look.view.radiance(reflected[look.light]) * look.factor
-            images[look.number] = self.traced.finished(
-                radiance, inputs[look.number], wholes[look.number]
+                reflected[look.light] = look.light.compute_reflected(fine)
+            radiance = look.view.compute_radiance(reflected[look.light]) * look.factor
+            images[look.camera_index] = self.path_renderer.finish_image(
+                radiance,
+                inputs[look.camera_index],
+                full_configurations[look.camera_index],
             )
         return torch.stack([images[number] for number in range(len(inputs))])
 
-    def pictures(self, us: Sequence[Tensor]) -> list[Tensor]:
+    def predict_images(self, us: Sequence[Tensor]) -> list[Tensor]:
         """Return images of configurations that differ in camera and environment alone.
 
         Many are made in one launch.
         """
         images = list[Tensor]()
         with torch.no_grad():
-            for begin in range(0, len(us), self.at_once):
-                batch = us[begin : begin + self.at_once]
-                inputs = [self.inputs(u) for u in batch]
-                images += self.shown(self.looks(inputs), inputs, self.there, batch)
+            for begin in range(0, len(us), self.batch_size):
+                batch = us[begin : begin + self.batch_size]
+                inputs = [self.compute_inputs(u) for u in batch]
+                images += self.compose_images(
+                    self.trace_views(inputs), inputs, self.base_color, batch
+                )
         return images
 
-    def radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
-        (look,) = self.looks([inputs])
-        fine = self.arrangement.finer(self.color(inputs))
-        return look.view.radiance(look.light.reflected(fine)) * look.factor
+    def predict_radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        (look,) = self.trace_views([inputs])
+        fine = self.arrangement.upsample(self.get_color(inputs))
+        return (
+            look.view.compute_radiance(look.light.compute_reflected(fine)) * look.factor
+        )
 
 
-def why_not(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
+def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
     """Return why light on surfaces cannot predict images of a space; None if it may.
 
     How far it is off is then for measurement.
@@ -276,46 +296,46 @@ def why_not(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
         varying: names of the controls that vary; the others are searched, and may
             change base colors alone.
     """
-    refusal = why_not_kept(renderer)
+    refusal = find_scene_refusal(renderer)
     if refusal is not None:
         return refusal
     for group in renderer.plan.groups:
         if group.control in varying or group.estimator == "image":
             continue
-        if renderer.routes.get(group.name, frozenset()) != {COLOR}:
+        if renderer.routes.get(group.name, frozenset()) != {COLOR_INPUT}:
             return Refusal(f"{group.name} changes more than the object's base colour")
-    changed = varied(renderer, varying)
-    if not changed <= FREE:
+    changed = find_changed_inputs(renderer, varying)
+    if not changed <= FREE_INPUTS:
         return Refusal(
-            f"{', '.join(sorted(changed - FREE))} varies, and light on "
+            f"{', '.join(sorted(changed - FREE_INPUTS))} varies, and light on "
             "surfaces is kept for one arrangement"
         )
-    if not changed & CAMERAS:
+    if not changed & CAMERA_INPUTS:
         return Refusal("no camera varies", RefusalCause.NO_CAMERA)
     return None
 
 
-def why_not_kept(renderer: Renderer) -> Refusal | None:
+def find_scene_refusal(renderer: Renderer) -> Refusal | None:
     """Return why light cannot be stored on a scene's surfaces; None if it may be."""
-    description = renderer.scene.made[0]
+    description = renderer.scene.definition[0]
     mesh_part = description.meshes[OBJECT]
     if mesh_part.mesh.repeats or mesh_part.surface is not None:
         return Refusal(
             "the object's surface repeats its texture, or is one of Mitsuba's own"
         )
-    has_more = len(description.parts) > 0 or description.emits
+    has_more = len(description.parts) > 0 or description.has_emission
     if description.environment is None or has_more:
         return Refusal(
             "there is more in the scene than the object, its ground and an environment"
         )
-    if renderer.scene.volumetric or description.thin_lens or description.backdrop:
+    if renderer.scene.is_volumetric or description.thin_lens or description.backdrop:
         return Refusal("there is haze, a lens with an aperture, or a plain background")
     if description.number("camera.drops") > 0.0:
         return Refusal("there are raindrops before the camera")
     return None if renderer.formation.denoiser == "oidn" else NOISE
 
 
-def varied(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
+def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
     """Return the names of the scene inputs that some controls change.
 
     `varying` has the names of controls, or of groups of coordinates.
@@ -323,13 +343,13 @@ def varied(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
     changed: set[str] = set()
     with torch.no_grad():
         start = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-        for value in BETWEEN:
+        for value in PROBE_FRACTIONS:
             u = renderer.start.clone()
             for group in renderer.space.groups:
                 if group.control in varying or group.name in varying:
                     u[group.coordinates] = value
             inputs = renderer.scene.assembly(renderer.space.inputs(u))
             for name in start.keys() | inputs.keys():
-                if differs(start.get(name), inputs.get(name)):
+                if inputs_differ(start.get(name), inputs.get(name)):
                     changed.add(name)
     return frozenset(changed)

@@ -26,21 +26,21 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.scene.assets import Bools, Doubles, Floats, Ints
+from advsearch.scene.assets import BoolArray, Float32Array, Float64Array, IntArray
 from advsearch.scene.mitsuba_backend.texel_rays import TexelGrid
-from advsearch.scene.raster import BORDER, Charts, rasterised
-from advsearch.scene.transport.matrix import by_rows
+from advsearch.scene.raster import BORDER_TEXELS, Charts, rasterize_charts
+from advsearch.scene.transport.matrix import to_torch_csr
 
-GROUND = 112  # texels along each side of the ground
+GROUND_TEXELS = 112  # texels along each side of the ground
 # half the width of the ground that has texels, object sizes; further out there is the
 # light of its border
-NEAR = 12.0
+MAX_GROUND_REACH = 12.0
 # width of the ground's texels under the center of the object, object sizes: contact
 # shadows are that sharp
-FINEST = 0.01
-REACH = 2  # texels in each direction whose light counts at a point
-WIDTH = 0.8  # standard deviation of the weight of their distance, texels
-SAME = 1.5
+MIN_TEXEL_WIDTH = 0.01
+FILTER_REACH = 2  # texels in each direction whose light counts at a point
+GRID_SIGMA = 0.8  # standard deviation of the weight of their distance, texels
+SPACE_SIGMA = 1.5
 """Standard deviation of the weight of their distance in space, widths of a texel.
 
 Texels of another chart do not count, nor those of the other wall of a cup.
@@ -54,43 +54,47 @@ class LitTexels:
     """The texels that store light: those cells of all grids that lie on a surface."""
 
     grids: tuple[TexelGrid, ...]  # of each surface, the searched one first
-    places: Floats  # (n, 3) positions in world space
-    normals: Floats  # (n, 3)
-    cells: Ints  # (n,) index of the cell of all grids that each lies in
+    positions: Float32Array  # (n, 3) positions in world space
+    normals: Float32Array  # (n, 3)
+    cells: IntArray  # (n,) index of the cell of all grids that each lies in
     # (cells of all grids,) index of the texel whose light each cell has, the nearest
-    of_cell: Ints
-    begin: tuple[int, ...]  # of each grid its first texel, and the number of all
+    texel_of_cell: IntArray
+    first_texels: tuple[int, ...]  # of each grid its first texel, and the number of all
 
-    def of(self, number: int) -> slice:
+    def select_grid(self, grid_index: int) -> slice:
         """Return the texels of a grid, by its index."""
-        return slice(self.begin[number], self.begin[number + 1])
+        return slice(self.first_texels[grid_index], self.first_texels[grid_index + 1])
 
 
-def together(some: Sequence[LitTexels]) -> LitTexels:
+def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
     """Join the texels of several surfaces, each with one grid."""
-    first_texels = np.cumsum([0] + [len(texels.places) for texels in some])
-    first_cells = np.cumsum([0] + [texels.grids[0].count for texels in some])
+    first_texels = np.cumsum([0] + [len(texels.positions) for texels in surfaces])
+    first_cells = np.cumsum([0] + [texels.grids[0].n_cells for texels in surfaces])
     grids = []
     cells = []
     texel_of_cell = []
     for texels, first_texel, first_cell in zip(
-        some, first_texels[:-1], first_cells[:-1], strict=True
+        surfaces, first_texels[:-1], first_cells[:-1], strict=True
     ):
-        grids.append(replace(texels.grids[0], first=int(first_cell)))
+        grids.append(replace(texels.grids[0], first_cell=int(first_cell)))
         cells.append(texels.cells + first_cell)
-        texel_of_cell.append(texels.of_cell + first_texel)
+        texel_of_cell.append(texels.texel_of_cell + first_texel)
     return LitTexels(
         grids=tuple(grids),
-        places=np.concatenate([texels.places for texels in some]),
-        normals=np.concatenate([texels.normals for texels in some]),
+        positions=np.concatenate([texels.positions for texels in surfaces]),
+        normals=np.concatenate([texels.normals for texels in surfaces]),
         cells=np.concatenate(cells),
-        of_cell=np.concatenate(texel_of_cell),
-        begin=tuple(int(first_texel) for first_texel in first_texels),
+        texel_of_cell=np.concatenate(texel_of_cell),
+        first_texels=tuple(int(first_texel) for first_texel in first_texels),
     )
 
 
-def on_mesh(
-    name: str, charts: Charts, vertices: Floats, normals: Floats, side: int = 0
+def make_mesh_texels(
+    name: str,
+    charts: Charts,
+    vertices: Float32Array,
+    normals: Float32Array,
+    side: int = 0,
 ) -> LitTexels:
     """Return the texels over a mesh.
 
@@ -101,20 +105,20 @@ def on_mesh(
         side: of its faces, as `TexelGrid` has it.
     """
     position, normal = _interpolate(charts, vertices, normals)
-    texel_of_covered = np.cumsum(charts.covered.ravel()) - 1
-    rows, columns = np.nonzero(charts.covered)
+    texel_of_covered = np.cumsum(charts.is_covered.ravel()) - 1
+    rows, columns = np.nonzero(charts.is_covered)
     return LitTexels(
-        grids=(TexelGrid(name, 0, charts.covered.shape, None, side),),
-        places=position[rows, columns],
+        grids=(TexelGrid(name, 0, charts.is_covered.shape, None, side),),
+        positions=position[rows, columns],
         normals=normal[rows, columns],
-        cells=np.flatnonzero(charts.covered),
-        of_cell=texel_of_covered[_find_nearest(charts.covered)],
-        begin=(0, len(rows)),
+        cells=np.flatnonzero(charts.is_covered),
+        texel_of_cell=texel_of_covered[_find_nearest(charts.is_covered)],
+        first_texels=(0, len(rows)),
     )
 
 
-def on_ground(
-    name: str, height: float, reach: float, middle: tuple[float, float]
+def make_ground_texels(
+    name: str, height: float, reach: float, center: tuple[float, float]
 ) -> LitTexels:
     """Return the texels over a level plane, small under the object and large far off.
 
@@ -122,21 +126,25 @@ def on_ground(
         name: of the ground.
         height: of the plane.
         reach: half its width.
-        middle: x and y of the object's center.
+        center: x and y of the object's center.
     """
-    reach = min(reach, NEAR)
-    rate = _find_warp_rate(reach / (FINEST * GROUND / 2.0))
+    reach = min(reach, MAX_GROUND_REACH)
+    rate = _find_warp_rate(reach / (MIN_TEXEL_WIDTH * GROUND_TEXELS / 2.0))
     scale = reach / math.sinh(rate)
-    position = (np.arange(GROUND) + 0.5) * 2.0 / GROUND - 1.0
+    position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
     offset = scale * np.sinh(rate * position)
-    y, x = np.meshgrid(offset + middle[1], offset + middle[0], indexing="ij")
+    y, x = np.meshgrid(offset + center[1], offset + center[0], indexing="ij")
     positions = np.stack([x, y, np.full_like(x, height)], axis=-1)
     positions = positions.reshape(-1, 3).astype(np.float32)
     up = np.array([0.0, 0.0, 1.0], dtype=np.float32)
     normals = np.broadcast_to(up, positions.shape).copy()
-    grid = TexelGrid(name, 0, (GROUND, GROUND), (middle[0], middle[1], scale, rate))
-    cells = np.arange(GROUND * GROUND)
-    return LitTexels((grid,), positions, normals, cells, cells, (0, GROUND * GROUND))
+    grid = TexelGrid(
+        name, 0, (GROUND_TEXELS, GROUND_TEXELS), (center[0], center[1], scale, rate)
+    )
+    cells = np.arange(GROUND_TEXELS * GROUND_TEXELS)
+    return LitTexels(
+        (grid,), positions, normals, cells, cells, (0, GROUND_TEXELS * GROUND_TEXELS)
+    )
 
 
 def _find_warp_rate(ratio: float) -> float:
@@ -155,13 +163,13 @@ def _find_warp_rate(ratio: float) -> float:
     return lower
 
 
-def between(
+def make_lookup_matrix(
     texels: LitTexels,
     charts: Charts,
     shape: tuple[int, int],
-    vertices: Floats,
-    normals: Floats,
-    buried: Bools,
+    vertices: Float32Array,
+    normals: Float32Array,
+    buried: BoolArray,
 ) -> Tensor:
     """Return the matrix that smooths light and looks it up in a finer grid.
 
@@ -180,27 +188,29 @@ def between(
         Sparse, (cells of the finer grid, texels of the first surface).
     """
     buried = buried & ~buried.all()
-    fine_charts = rasterised(charts.mesh, shape)
+    fine_charts = rasterize_charts(charts.mesh, shape)
     position, normal = _interpolate(fine_charts, vertices, normals)
-    rows, columns = np.nonzero(fine_charts.distance <= BORDER)
+    rows, columns = np.nonzero(fine_charts.distance <= BORDER_TEXELS)
     points = position[rows, columns]
     point_normals = normal[rows, columns]
     texel_width = _texel_width(charts, vertices)
-    n_rows, n_columns = charts.covered.shape
+    n_rows, n_columns = charts.is_covered.shape
     y = (rows + 0.5) * n_rows / shape[0] - 0.5
     x = (columns + 0.5) * n_columns / shape[1] - 0.5
 
-    texel_of_position = np.cumsum(charts.covered.ravel()).reshape(n_rows, n_columns) - 1
-    texel_of_position = np.where(charts.covered, texel_of_position, -1)
+    texel_of_position = (
+        np.cumsum(charts.is_covered.ravel()).reshape(n_rows, n_columns) - 1
+    )
+    texel_of_position = np.where(charts.is_covered, texel_of_position, -1)
     neighbours = []
     neighbour_weights = []
-    for row, column in _neighbourhood(y, x):
+    for row, column in _iter_neighbourhood(y, x):
         inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
         clipped = row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
         texel = np.where(inside, texel_of_position[clipped], -1)
-        grid_distance = ((row - y) ** 2 + (column - x) ** 2) / (2.0 * WIDTH**2)
-        offset = texels.places[texel] - points
-        distance = (offset**2).sum(axis=1) / (2.0 * (SAME * texel_width) ** 2)
+        grid_distance = ((row - y) ** 2 + (column - x) ** 2) / (2.0 * GRID_SIGMA**2)
+        offset = texels.positions[texel] - points
+        distance = (offset**2).sum(axis=1) / (2.0 * (SPACE_SIGMA * texel_width) ** 2)
         cosine = (texels.normals[texel] * point_normals).sum(axis=1)
         similarity = np.clip(cosine, 0.0, 1.0) ** 8
         weight = np.exp(-grid_distance - distance) * similarity
@@ -214,7 +224,9 @@ def between(
     lost = weights.sum(axis=1) < 1e-6
     nearest_row = np.round(y[lost]).astype(int).clip(0, n_rows - 1)
     nearest_column = np.round(x[lost]).astype(int).clip(0, n_columns - 1)
-    texel_index[lost, 0] = texels.of_cell[nearest_row * n_columns + nearest_column]
+    texel_index[lost, 0] = texels.texel_of_cell[
+        nearest_row * n_columns + nearest_column
+    ]
     weights[lost, 0] = 1.0
     weights /= weights.sum(axis=1, keepdims=True)
 
@@ -222,28 +234,30 @@ def between(
     fine_cell = (rows * shape[1] + columns)[:, None]
     cell = np.broadcast_to(fine_cell, texel_index.shape)[is_entry]
     entries = (weights[is_entry].astype(np.float32), (cell, texel_index[is_entry]))
-    size = shape[0] * shape[1], texels.begin[1]
-    return by_rows(scipy.sparse.coo_matrix(entries, size).tocsr())
+    size = shape[0] * shape[1], texels.first_texels[1]
+    return to_torch_csr(scipy.sparse.coo_matrix(entries, size).tocsr())
 
 
-def _texel_width(charts: Charts, vertices: Floats) -> float:
+def _texel_width(charts: Charts, vertices: Float32Array) -> float:
     """Return the mean width of a texel in world space, for vertices (V, 3) there."""
     extent = float(np.ptp(charts.mesh.vertices, axis=0).max())
     scale = np.ptp(vertices, axis=0).max() / max(extent, 1e-12)
-    area = float(charts.areas()[charts.covered].mean()) * float(scale) ** 2
+    area = float(charts.compute_areas()[charts.is_covered].mean()) * float(scale) ** 2
     return math.sqrt(max(area, 1e-12))
 
 
-def _neighbourhood(y: Doubles, x: Doubles) -> Iterator[tuple[Ints, Ints]]:
+def _iter_neighbourhood(
+    y: Float64Array, x: Float64Array
+) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield rows and columns of texels around positions, one offset at a time."""
-    for row_offset in range(-REACH, REACH + 1):
-        for column_offset in range(-REACH, REACH + 1):
+    for row_offset in range(-FILTER_REACH, FILTER_REACH + 1):
+        for column_offset in range(-FILTER_REACH, FILTER_REACH + 1):
             row = np.round(y).astype(int) + row_offset
             column = np.round(x).astype(int) + column_offset
             yield row, column
 
 
-def smoothed(ground: LitTexels, lit: Bools) -> Tensor:
+def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
     """Return the matrix that smooths the light of a ground, by 5 x 5 binomial weights.
 
     Texels that see nothing of the sky lie under something. What is next to it is not
@@ -251,13 +265,13 @@ def smoothed(ground: LitTexels, lit: Bools) -> Tensor:
 
     Args:
         ground: the texels of a ground.
-        lit: (n,) whether each sees something of the sky; if none does, all count.
+        sees_sky: (n,) whether each sees something of the sky; if none does, all count.
 
     Returns:
         Sparse, (cells, texels).
     """
     width = ground.grids[0].shape[0]
-    is_used = (lit if lit.any() else ~lit).reshape(width, width)
+    is_used = (sees_sky if sees_sky.any() else ~sees_sky).reshape(width, width)
     source = _find_nearest(is_used)
     band = scipy.sparse.diags_array(
         BINOMIAL, offsets=range(-2, 3), shape=(width, width), dtype=np.float64
@@ -268,12 +282,12 @@ def smoothed(ground: LitTexels, lit: Bools) -> Tensor:
     )
     row_sums = np.repeat(weights.sum(axis=1), np.diff(weights.indptr))
     weights.data /= np.maximum(row_sums, 1e-12)
-    return by_rows(weights.astype(np.float32)[source])
+    return to_torch_csr(weights.astype(np.float32)[source])
 
 
 def _interpolate(
-    charts: Charts, vertices: Floats, normals: Floats
-) -> tuple[Floats, Floats]:
+    charts: Charts, vertices: Float32Array, normals: Float32Array
+) -> tuple[Float32Array, Float32Array]:
     """Return the position and the unit normal of each cell, both (h, w, 3)."""
     corners = charts.mesh.faces[charts.face]
     position = np.einsum("hwk,hwkc->hwc", charts.weights, vertices[corners])
@@ -283,7 +297,7 @@ def _interpolate(
     return position.astype(np.float32), unit_normal.astype(np.float32)
 
 
-def _find_nearest(covered: Bools) -> Ints:
+def _find_nearest(covered: BoolArray) -> IntArray:
     """Return for each cell of a grid the flat index of the nearest covered one."""
     # takes long to import
     from scipy import ndimage
@@ -291,12 +305,12 @@ def _find_nearest(covered: Bools) -> Ints:
     rows, columns = ndimage.distance_transform_edt(
         ~covered, return_distances=False, return_indices=True
     )
-    nearest: Ints = (rows * covered.shape[1] + columns).ravel()
+    nearest: IntArray = (rows * covered.shape[1] + columns).ravel()
     return nearest
 
 
-CELLS = (32, 64)  # rows and columns of the cells of the environment
-WIDTHS = (
+SKY_SHAPE = (32, 64)  # rows and columns of the cells of the environment
+BLUR_WIDTHS = (
     math.radians(3.0),
     math.radians(6.0),
     math.radians(12.0),
@@ -304,18 +318,20 @@ WIDTHS = (
     math.radians(48.0),
 )
 """Angles by which the environment is blurred for gloss, radians."""
-BLURRED = (64, 128)  # rows and columns of the blurred maps
+BLURRED_SHAPE = (64, 128)  # rows and columns of the blurred maps
 # multiples of the mean luminance above which light of the environment is hot: it has
 # rays of its own
-HOT = 8.0
+HOT_FACTOR = 8.0
 HOT_RAYS = 48  # rays from each texel towards such light
-SPREAD = (7, 11)
+HOT_LATTICE = (7, 11)
 """Steps along rows and columns of a lattice of `HOT_RAYS` points.
 
 11 / 7 is 29 modulo 48, next to the golden ratio, and both coordinates are even.
 """
-LITTLE = 0.02  # fraction of the light up to which what is hot is left to the cells
-LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
+MIN_HOT_FRACTION = (
+    0.02  # fraction of the light up to which what is hot is left to the cells
+)
+LUMINANCE_WEIGHTS = torch.tensor([0.2126, 0.7152, 0.0722])
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,15 +339,15 @@ class SkyLight:
     """An environment's light, prepared for look-ups."""
 
     padded: Tensor  # (H, W + 2, 3)
-    # (rows x columns, 3) mean radiance of each of `CELLS`, without what is hot
+    # (rows x columns, 3) mean radiance of each of `SKY_SHAPE`, without what is hot
     cells: Tensor
-    map: Tensor  # `BLURRED`, (h, w, 3)
+    map: Tensor  # `BLURRED_SHAPE`, (h, w, 3)
     # (k, 3) unit directions in the map's own axes towards what is hot, and (k, 3)
     # radiance times solid angle
     hot: tuple[Tensor, Tensor]
 
 
-def sky_of(padded: Tensor) -> SkyLight:
+def prepare_sky(padded: Tensor) -> SkyLight:
     """Prepare an environment's map (H, W + 2, 3) for look-ups."""
     radiance = padded[:, 1:-1].detach()
     n_rows, n_columns = radiance.shape[:2]
@@ -339,11 +355,11 @@ def sky_of(padded: Tensor) -> SkyLight:
     # the solid angle of a texel; at the poles it is not zero
     sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
     sine = sine[:, None].expand(n_rows, n_columns)
-    luminance = radiance @ LUMINANCE
+    luminance = radiance @ LUMINANCE_WEIGHTS
     mean = float((luminance * sine).sum() / sine.sum())
-    hot_fraction = (1.0 - HOT * mean / luminance.clamp_min(1e-12)).clamp_min(0.0)
+    hot_fraction = (1.0 - HOT_FACTOR * mean / luminance.clamp_min(1e-12)).clamp_min(0.0)
     hot_power = hot_fraction * luminance * sine
-    if float(hot_power.sum()) > LITTLE * mean * float(sine.sum()):
+    if float(hot_power.sum()) > MIN_HOT_FRACTION * mean * float(sine.sum()):
         hot = _sample_hot(radiance * hot_fraction[..., None], hot_power)
         even = radiance * (1.0 - hot_fraction[..., None])
     else:
@@ -351,8 +367,8 @@ def sky_of(padded: Tensor) -> SkyLight:
         even = radiance
     return SkyLight(
         padded,
-        _pool(even, sine, CELLS).reshape(-1, 3),
-        _pool(radiance, sine, BLURRED),
+        _pool(even, sine, SKY_SHAPE).reshape(-1, 3),
+        _pool(radiance, sine, BLURRED_SHAPE),
         hot,
     )
 
@@ -361,7 +377,7 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     """Sample directions to what is hot by its power, and what comes from each.
 
     A map is looked up between its texels, so that each shines over a tent that reaches
-    its neighbours. Directions are spread over that by `SPREAD`: a sun of one texel has
+    its neighbours. Directions are spread over that by `HOT_LATTICE`: a sun of one texel has
     a soft shadow.
 
     Args:
@@ -378,13 +394,13 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     texel = torch.searchsorted(cumulative, steps).clamp_max(power.numel() - 1)
     row = texel // n_columns
     column = texel % n_columns
-    row_offset = _to_tent((index * SPREAD[0] % HOT_RAYS + 0.5) / HOT_RAYS)
-    column_offset = _to_tent((index * SPREAD[1] % HOT_RAYS + 0.5) / HOT_RAYS)
+    row_offset = _to_tent((index * HOT_LATTICE[0] % HOT_RAYS + 0.5) / HOT_RAYS)
+    column_offset = _to_tent((index * HOT_LATTICE[1] % HOT_RAYS + 0.5) / HOT_RAYS)
     polar = ((row + row_offset) * (math.pi / (n_rows - 1))).clamp(0.0, math.pi)
     azimuth = (column + 0.5 + column_offset) * (2.0 * math.pi / n_columns)
     solid_angle = math.pi / (n_rows - 1) * 2.0 * math.pi / n_columns
     color = radiance[row, column]
-    color = color / (color @ LUMINANCE)[:, None].clamp_min(1e-12)
+    color = color / (color @ LUMINANCE_WEIGHTS)[:, None].clamp_min(1e-12)
     power_per_ray = float(power.sum()) * solid_angle / HOT_RAYS
     return _to_direction(polar, azimuth, dim=1).float(), color * power_per_ray
 
@@ -413,8 +429,8 @@ def _pool(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
     return pooled[..., :3] / pooled[..., 3:].clamp_min(1e-12)
 
 
-def blurred(radiance: Tensor) -> Tensor:
-    """Blur a map (h, w, 3) by each of `WIDTHS`.
+def blur_map(radiance: Tensor) -> Tensor:
+    """Blur a map (h, w, 3) by each of `BLUR_WIDTHS`.
 
     They are root mean squares over both directions. Rows and columns are blurred one
     after the other, more along rows towards the poles.
@@ -426,7 +442,7 @@ def blurred(radiance: Tensor) -> Tensor:
     polar = (torch.arange(n_rows) + 0.5) * math.pi / n_rows
     frequency = torch.arange(n_columns // 2 + 1)
     maps = []
-    for width in WIDTHS:
+    for width in BLUR_WIDTHS:
         sigma = width / math.sqrt(2.0)
         squared = (polar[:, None] - polar[None, :]).square() / (2.0 * sigma**2)
         across_rows = torch.exp(-squared) * polar.sin()[None, :]
@@ -442,7 +458,7 @@ def blurred(radiance: Tensor) -> Tensor:
     return torch.stack(maps).clamp_min(0.0)
 
 
-def directions(size: tuple[int, int]) -> Tensor:
+def compute_directions(size: tuple[int, int]) -> Tensor:
     """Return the unit directions (h, w, 3) of the cells of a map, in its own axes."""
     n_rows, n_columns = size
     polar = (torch.arange(n_rows) + 0.5) * math.pi / n_rows
@@ -451,8 +467,8 @@ def directions(size: tuple[int, int]) -> Tensor:
     return _to_direction(polar, azimuth, dim=-1)
 
 
-def irradiance(
-    seen: tuple[Tensor, Tensor],
+def compute_irradiance(
+    view_matrices: tuple[Tensor, Tensor],
     sky: SkyLight,
     direct: Tensor | None,
     reflectance: Tensor,
@@ -461,7 +477,7 @@ def irradiance(
     """Return the irradiance (n, 3) of texels.
 
     Args:
-        seen: views of the sky (n, cells) and of each other (n, n), sparse, times the
+        view_matrices: views of the sky (n, cells) and of each other (n, n), sparse, times the
             cosine and pi.
         sky: the environment.
         direct: (n, k) cosines towards what is hot where it is visible; None if nothing
@@ -469,7 +485,7 @@ def irradiance(
         reflectance: (n, 3) of the texels.
         bounces: how often light goes from texel to texel.
     """
-    sky_view, texel_view = seen
+    sky_view, texel_view = view_matrices
     from_sky = sky_view @ sky.cells
     if direct is not None:
         from_sky = from_sky + direct @ sky.hot[1]
@@ -480,9 +496,9 @@ def irradiance(
 
 
 def make_view_matrices(
-    met_cells: npt.NDArray[np.int32], texel_of_cell: Ints, n_texels: int
+    met_cells: npt.NDArray[np.int32], texel_of_cell: IntArray, n_texels: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the sparse matrices that `irradiance` needs, from what rays met.
+    """Return the sparse matrices that `compute_irradiance` needs, from what rays met.
 
     Args:
         met_cells: (n, rays) as of `trace_texel_rays`.
@@ -496,28 +512,28 @@ def make_view_matrices(
     is_texel = (cell >= 0) & (cell < len(texel_of_cell))
 
     def make_matrix(
-        mask: Bools, column: npt.NDArray[np.integer[Any]], width: int
+        mask: BoolArray, column: npt.NDArray[np.integer[Any]], width: int
     ) -> Tensor:
         values = np.full(len(column), math.pi / n_rays, dtype=np.float32)
         entries = (values, (row[mask], column))
-        return by_rows(scipy.sparse.coo_matrix(entries, (count, width)).tocsr())
+        return to_torch_csr(scipy.sparse.coo_matrix(entries, (count, width)).tocsr())
 
     sky_column = cell[is_sky] - len(texel_of_cell)
-    sky_view = make_matrix(is_sky, sky_column, CELLS[0] * CELLS[1])
+    sky_view = make_matrix(is_sky, sky_column, SKY_SHAPE[0] * SKY_SHAPE[1])
     texel_view = make_matrix(is_texel, texel_of_cell[cell[is_texel]], n_texels)
     return sky_view, texel_view
 
 
-def looked_up(padded: Tensor, ways: Tensor) -> Tensor:
+def look_up_environment(padded: Tensor, directions: Tensor) -> Tensor:
     """Look an environment up in given directions, at the nearest texel.
 
     Args:
         padded: (H, W + 2, 3) map.
-        ways: (n, 3) directions in the map's own axes.
+        directions: (n, 3) directions in the map's own axes.
     """
     n_rows = padded.shape[0]
     n_columns = padded.shape[1] - 2
-    x, y, z = (ways / ways.norm(dim=1, keepdim=True)).unbind(dim=1)
+    x, y, z = (directions / directions.norm(dim=1, keepdim=True)).unbind(dim=1)
     azimuth = torch.remainder(torch.atan2(x, -z) / (2.0 * math.pi), 1.0)
     row = (torch.acos(y.clamp(-1.0, 1.0)) * ((n_rows - 1) / math.pi)).round().long()
     column = (azimuth * n_columns).long().clamp_max(n_columns - 1)

@@ -25,54 +25,54 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.geometry import real_harmonics
+from advsearch.scene.assembly import IMAGE_INPUTS
+from advsearch.scene.geometry import compute_real_harmonics
 from advsearch.scene.gradients import Group
-from advsearch.scene.parts import PATTERN, PluginPart
+from advsearch.scene.parts import PATTERN_SUFFIX, PluginPart
 from advsearch.scene.predictor import (
-    BETWEEN,
     NOISE,
+    PROBE_FRACTIONS,
     Predictor,
     Refusal,
     RefusalCause,
-    differs,
+    inputs_differ,
 )
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import (
-    SPP,
+    COLLECTED_SPP,
     Inputs,
     LinearRenderer,
-    Tick,
-    linear_inputs,
-    passes,
-    untold,
+    ProgressCallback,
+    find_linear_inputs,
+    ignore_progress,
+    plan_passes,
 )
 
-ENVIRONMENT = "environment.padded"
+ENVIRONMENT_INPUT = "environment.padded"
 # ends of names of inputs that are the light of a lamp, (3,)
-LAMPS = (".intensity", ".radiance")
+LAMP_SUFFIXES = (".intensity", ".radiance")
 # largest relative difference between a map and a multiple of another one: float32
 # through a tone curve and back
-SAME = 1e-3
-PROBED = 64  # largest number of options of a discrete choice that are compared
+MAX_RELATIVE_DIFFERENCE = 1e-3
+MAX_OPTIONS = 64  # largest number of options of a discrete choice that are compared
 TINY = 1e-30
-FEW = 4  # step in rows and columns of a map for a first comparison
+COARSE_STEP = 4  # step in rows and columns of a map for a first comparison
 
 
-def light_inputs(renderer: Renderer) -> frozenset[str]:
+def find_light_inputs(renderer: Renderer) -> frozenset[str]:
     """Return the names of a scene's inputs that are light."""
     return frozenset(
         name
-        for name in renderer.scene.names
-        if name == ENVIRONMENT or name.endswith(LAMPS)
+        for name in renderer.scene.input_names
+        if name == ENVIRONMENT_INPUT or name.endswith(LAMP_SUFFIXES)
     )
 
 
-def fixed_lights(renderer: Renderer) -> bool:
+def has_fixed_lights(renderer: Renderer) -> bool:
     """Return whether a light of the scene is no input: one of a Mitsuba scene."""
     return any(
-        isinstance(part, PluginPart) and part.shines
-        for part in renderer.scene.made[0].parts
+        isinstance(part, PluginPart) and part.emits_light
+        for part in renderer.scene.definition[0].parts
     )
 
 
@@ -85,18 +85,20 @@ class Lighting:
 
     # by `control.parameter`, the inputs changed; none if it changes the finished image
     groups: Mapping[str, frozenset[str]]
-    harmonic: frozenset[str]  # groups that add spherical harmonics to the environment
+    harmonic_groups: frozenset[
+        str
+    ]  # groups that add spherical harmonics to the environment
     # of the others that change a map, their coordinates and the values where it is
     # brightest: a basis map must not be black in a channel
-    bright: Sequence[tuple[slice, Tensor]] = ()
+    brightest_values: Sequence[tuple[slice, Tensor]] = ()
 
     @property
-    def moved(self) -> frozenset[str]:
+    def changed_inputs(self) -> frozenset[str]:
         """The scene's inputs that change."""
-        return frozenset[str]().union(*self.groups.values()) - ON_PICTURE
+        return frozenset[str]().union(*self.groups.values()) - IMAGE_INPUTS
 
 
-def lighting(renderer: Renderer) -> Lighting:
+def find_lighting(renderer: Renderer) -> Lighting:
     """Find the groups of coordinates that change nothing but light and finished images.
 
     The inputs of configurations are compared, so that it holds for whatever sets them.
@@ -113,12 +115,12 @@ def lighting(renderer: Renderer) -> Lighting:
             effect = _measure_effect(renderer, group, middle, base_inputs)
             if effect is None:
                 continue
-            if not effect.changed <= ON_PICTURE and fixed_lights(renderer):
+            if not effect.changed <= IMAGE_INPUTS and has_fixed_lights(renderer):
                 continue
             groups[group.name] = effect.changed
             if effect.is_harmonic:
                 harmonic.add(group.name)
-            elif ENVIRONMENT in effect.changed:
+            elif ENVIRONMENT_INPUT in effect.changed:
                 brightest = effect.brightest[group.coordinates]
                 bright.append((group.coordinates, brightest))
     return Lighting(groups, frozenset(harmonic), tuple(bright))
@@ -154,10 +156,10 @@ def _measure_effect(
                 return None
             if change is not _Change.NONE:
                 changed.add(name)
-            if name == ENVIRONMENT and change is _Change.HARMONICS:
+            if name == ENVIRONMENT_INPUT and change is _Change.HARMONICS:
                 is_harmonic = True
-        if ENVIRONMENT in inputs:
-            power = float(inputs[ENVIRONMENT].sum())
+        if ENVIRONMENT_INPUT in inputs:
+            power = float(inputs[ENVIRONMENT_INPUT].sum())
             if power > max_power:
                 max_power = power
                 brightest = configuration
@@ -166,9 +168,9 @@ def _measure_effect(
 
 def _sample_configurations(group: Group, middle: Tensor) -> Iterator[Tensor]:
     """Yield configurations in which a group has several values, and others `middle`'s."""
-    fractions = list(BETWEEN)
+    fractions = list(PROBE_FRACTIONS)
     if group.options:
-        step = -(-group.options // PROBED)
+        step = -(-group.options // MAX_OPTIONS)
         options = range(0, group.options, step)
         fractions = [(option + 0.5) / group.options for option in options]
     values = [torch.full((group.size,), fraction) for fraction in fractions]
@@ -196,19 +198,21 @@ def _find_change(
     """Return how a group of coordinates changes an input."""
     if before is None or after is None:
         return _Change.OTHER
-    if not differs(before, after):
+    if not inputs_differ(before, after):
         return _Change.NONE
-    if name in ON_PICTURE or name.endswith(LAMPS):
+    if name in IMAGE_INPUTS or name.endswith(LAMP_SUFFIXES):
         return _Change.POWER
-    if name != ENVIRONMENT or before.shape != after.shape:
+    if name != ENVIRONMENT_INPUT or before.shape != after.shape:
         return _Change.OTHER
     if _is_explained(before[None], after):
         return _Change.POWER
     if n_coordinates == 1:  # one number adds no harmonics of a choice
         return _Change.OTHER
-    basis = torch.cat([before[None], _harmonic_maps(before)])
+    basis = torch.cat([before[None], _make_harmonic_maps(before)])
     # rejects most other changes in a tenth of the time
-    if not _is_explained(basis[:, ::FEW, ::FEW], after[::FEW, ::FEW]):
+    if not _is_explained(
+        basis[:, ::COARSE_STEP, ::COARSE_STEP], after[::COARSE_STEP, ::COARSE_STEP]
+    ):
         return _Change.OTHER
     return _Change.HARMONICS if _is_explained(basis, after) else _Change.OTHER
 
@@ -216,18 +220,18 @@ def _find_change(
 def _is_explained(basis: Tensor, target: Tensor) -> bool:
     """Return whether a map is a sum of basis maps, where it and the first are lit."""
     is_lit = ((basis[0] > 0.0) & (target > 0.0)).to(torch.float32)
-    span = Span(basis * is_lit)
-    residual = target * is_lit - span.map(span.weights(target * is_lit))
-    return float(residual.norm()) <= SAME * float(target.norm())
+    span = BasisMaps(basis * is_lit)
+    residual = target * is_lit - span.compose(span.fit_weights(target * is_lit))
+    return float(residual.norm()) <= MAX_RELATIVE_DIFFERENCE * float(target.norm())
 
 
-def _harmonic_maps(like: Tensor) -> Tensor:
+def _make_harmonic_maps(like: Tensor) -> Tensor:
     """Return spherical harmonics of degrees 0 to 2 as maps (9, H, W, 3).
 
     Each is lifted to at least zero by a multiple of the first. Size and mean are those
     of the map `like`.
     """
-    basis = real_harmonics(like.shape[0], like.shape[1] - 2)
+    basis = compute_real_harmonics(like.shape[0], like.shape[1] - 2)
     padded = torch.cat([basis[:, -1:], basis, basis[:, :1]], dim=1).permute(2, 0, 1)
     lifted = padded - padded.amin(dim=(1, 2), keepdim=True).clamp_max(0.0)
     scaled = lifted * float(like.mean().clamp_min(1e-12))
@@ -235,17 +239,17 @@ def _harmonic_maps(like: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Span:
+class BasisMaps:
     """Basis maps of an environment, and how a map is composed of them."""
 
     maps: Tensor  # (k, H, W, 3), all at least zero
 
-    def weights(self, lit: Tensor) -> Tensor:
+    def fit_weights(self, target: Tensor) -> Tensor:
         """Return the weights (k, 3) with which the maps come nearest to a map.
 
         That is (H, W, 3); the weights are differentiable.
         """
-        flat = lit.permute(2, 0, 1).reshape(3, -1, 1)
+        flat = target.permute(2, 0, 1).reshape(3, -1, 1)
         # It is a multiple of the only map, and the brightest texel of each channel has
         # the factor.
         if len(self.maps) == 1:
@@ -254,7 +258,7 @@ class Span:
         weights: Tensor = (self._inverse @ flat)[..., 0].T
         return weights
 
-    def map(self, weights: Tensor) -> Tensor:
+    def compose(self, weights: Tensor) -> Tensor:
         """Return the map (H, W, 3) with given weights (k, 3)."""
         return torch.einsum("khwc,kc->hwc", self.maps, weights)
 
@@ -280,7 +284,7 @@ class Span:
 # ---- images
 
 
-class Lights:
+class LightBasis:
     """The lights of a scene of which some change, each separately.
 
     Args:
@@ -289,55 +293,61 @@ class Lights:
         inputs: scene inputs whose map is the environment's first basis map.
 
     Attributes:
-        alone: the inputs of each light, in which all others are dark.
+        inputs_of_light: the inputs of each light, in which all others are dark.
     """
 
     def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
-        patterns = {name for name in renderer.scene.names if name.endswith(PATTERN)}
-        names = light_inputs(renderer) | patterns
+        patterns = {
+            name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
+        }
+        names = find_light_inputs(renderer) | patterns
         values = {
-            name: inputs[name] if name in inputs else renderer.scene.base(name)
+            name: inputs[name]
+            if name in inputs
+            else renderer.scene.get_base_value(name)
             for name in sorted(names)
         }
         dark = {name: torch.zeros_like(value) for name, value in values.items()}
-        moved = lighting.moved
+        moved = lighting.changed_inputs
         # light that does not change
         still = {
             name: value
             for name, value in values.items()
             if name in patterns or (name not in moved and bool((value > 0.0).any()))
         }
-        self._lamps = sorted(moved & names - {ENVIRONMENT})
-        changes_environment = ENVIRONMENT in moved
+        self._lamps = sorted(moved & names - {ENVIRONMENT_INPUT})
+        changes_environment = ENVIRONMENT_INPUT in moved
         self._still = bool(still) or not (self._lamps or changes_environment)
-        self.alone: list[Inputs] = [{**dark, **still}] if self._still else []
-        self.alone += [{**dark, name: torch.ones(3)} for name in self._lamps]
-        self._span: Span | None = None
+        self.inputs_of_light: list[Inputs] = [{**dark, **still}] if self._still else []
+        self.inputs_of_light += [{**dark, name: torch.ones(3)} for name in self._lamps]
+        self._span: BasisMaps | None = None
         if changes_environment:
-            maps = _basis_maps(renderer, lighting, values[ENVIRONMENT])
-            self._span = Span(maps)
-            self.alone += [{**dark, ENVIRONMENT: basis} for basis in maps]
+            maps = _make_basis_maps(renderer, lighting, values[ENVIRONMENT_INPUT])
+            self._span = BasisMaps(maps)
+            self.inputs_of_light += [
+                {**dark, ENVIRONMENT_INPUT: basis} for basis in maps
+            ]
 
-    def weights(self, inputs: Inputs) -> Tensor:
+    def compute_weights(self, inputs: Inputs) -> Tensor:
         """Return the weight (lights, 3) of each light in scene inputs; differentiable."""
         weights = [torch.ones(1, 3)] if self._still else []
         weights += [inputs[name].reshape(1, 3) for name in self._lamps]
         if self._span is not None:
-            weights.append(self._span.weights(inputs[ENVIRONMENT]))
+            weights.append(self._span.fit_weights(inputs[ENVIRONMENT_INPUT]))
         return torch.cat(weights)
 
 
-def _basis_maps(renderer: Renderer, lighting: Lighting, first: Tensor) -> Tensor:
+def _make_basis_maps(renderer: Renderer, lighting: Lighting, first: Tensor) -> Tensor:
     """Return the environment's basis maps (k, H, W, 3), of which one is given."""
-    if not lighting.harmonic:
+    if not lighting.harmonic_groups:
         return first[None]
     start_inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-    start = start_inputs[ENVIRONMENT]
+    start = start_inputs[ENVIRONMENT_INPUT]
     # harmonics are added where the environment is not cut off at zero
     is_added = first > 0.0
     if start.shape == first.shape:
         is_added = is_added | (start <= 0.0)
-    harmonics = _harmonic_maps(first) * is_added.to(torch.float32)
+    harmonics = _make_harmonic_maps(first) * is_added.to(torch.float32)
     return torch.cat([first[None], harmonics])
 
 
@@ -358,25 +368,25 @@ class BasisRenderer(Predictor):
         traced: Renderer,
         u: Tensor,
         seed: int,
-        tick: Tick = untold,
+        tick: ProgressCallback = ignore_progress,
         *,
-        moving: Lighting | None = None,
+        changing: Lighting | None = None,
     ) -> None:
         super().__init__(traced)
         with torch.no_grad():
-            moving = moving or lighting(traced)
+            changing = changing or find_lighting(traced)
             # with as much light of the environment as there can be
             brightest = u.detach().clone()
-            for coordinates, values in moving.bright:
+            for coordinates, values in changing.brightest_values:
                 brightest[coordinates] = values
             inputs = traced.scene.assembly(traced.space.inputs(brightest))
-            self._lights = Lights(traced, moving, inputs)
+            self._lights = LightBasis(traced, changing, inputs)
             set_inputs = traced.scene.assembly(traced.space.inputs(u)).keys()
-            linear = set_inputs & linear_inputs(traced)
+            linear = set_inputs & find_linear_inputs(traced)
             # projectors are in the first light alone
-            base_colors = {name for name in linear if not name.endswith(PATTERN)}
+            base_colors = {name for name in linear if not name.endswith(PATTERN_SUFFIX)}
             self._renderers: list[LinearRenderer] = []
-            for index, light_inputs in enumerate(self._lights.alone):
+            for index, light_inputs in enumerate(self._lights.inputs_of_light):
                 noise_seed = seeds.stream(seed, "light", index)
                 self._renderers.append(
                     LinearRenderer(
@@ -391,20 +401,20 @@ class BasisRenderer(Predictor):
         self.non_finite = sum(renderer.non_finite for renderer in self._renderers)
 
     @property
-    def lights(self) -> int:
+    def n_traced_images(self) -> int:
         return len(self._renderers)
 
     @property
-    def entries(self) -> int:
-        return sum(renderer.entries for renderer in self._renderers)
+    def n_entries(self) -> int:
+        return sum(renderer.n_entries for renderer in self._renderers)
 
     @property
-    def bytes(self) -> int:
-        return sum(renderer.bytes for renderer in self._renderers)
+    def n_bytes(self) -> int:
+        return sum(renderer.n_bytes for renderer in self._renderers)
 
-    def radiance(self, inputs: Inputs) -> Tensor:
-        images = [renderer.radiance(inputs) for renderer in self._renderers]
-        weights = self._lights.weights(inputs)
+    def predict_radiance(self, inputs: Inputs) -> Tensor:
+        images = [renderer.predict_radiance(inputs) for renderer in self._renderers]
+        weights = self._lights.compute_weights(inputs)
         basis = torch.stack(images)[..., :3]
         radiance = torch.einsum("lc,lhwc->hwc", weights, basis)
         return torch.cat([radiance, images[0][..., 3:]], dim=-1)
@@ -413,7 +423,7 @@ class BasisRenderer(Predictor):
 HAZE = Refusal("there is haze", RefusalCause.HAZE)
 
 
-def why_not(renderer: Renderer, varying: Collection[str] = ()) -> Refusal | None:
+def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal | None:
     """Return why images of a space cannot be predicted; None if they can.
 
     Args:
@@ -421,10 +431,10 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> Refusal | None
         varying: names of controls that vary. They are fixed for each matrix, whatever
             they change; if there are any, light may not change.
     """
-    linear = linear_inputs(renderer)
+    linear = find_linear_inputs(renderer)
     searched = [group for group in renderer.plan.groups if group.control not in varying]
-    lit = {} if varying else lighting(renderer).groups
-    parts = renderer.scene.made[0].parts
+    lit = {} if varying else find_lighting(renderer).groups
+    parts = renderer.scene.definition[0].parts
     haze_prefixes = tuple(f"{part.name}." for part in parts if part.volumetric)
     for group in searched:
         if group.is_forced and group.estimator not in ("none", "image"):
@@ -435,7 +445,7 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> Refusal | None
         )
         if group.estimator == "image" or group.name in lit or is_haze:
             continue
-        if reached & light_inputs(renderer) and fixed_lights(renderer):
+        if reached & find_light_inputs(renderer) and has_fixed_lights(renderer):
             return Refusal(
                 f"{group.name} changes light, and the scene has other lights of its own"
             )
@@ -446,39 +456,41 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> Refusal | None
         renderer.routes.get(group.name) or lit.get(group.name) for group in searched
     ):
         return Refusal("nothing that is searched needs a render to be differentiated")
-    if renderer.scene.volumetric and not all(group.name in lit for group in searched):
+    if renderer.scene.is_volumetric and not all(
+        group.name in lit for group in searched
+    ):
         return HAZE
     return None if renderer.formation.denoiser == "oidn" else NOISE
 
 
-def predicting(
-    renderer: Renderer, u: Tensor, seed: int, tick: Tick = untold
+def make_predictor(
+    renderer: Renderer, u: Tensor, seed: int, tick: ProgressCallback = ignore_progress
 ) -> Predictor:
     """Make what predicts the images of a renderer's space, at u.
 
     Arguments as for `LinearRenderer`.
     """
-    moving = lighting(renderer)
-    if moving.moved:
-        return BasisRenderer(renderer, u, seed, tick, moving=moving)
+    moving = find_lighting(renderer)
+    if moving.changed_inputs:
+        return BasisRenderer(renderer, u, seed, tick, changing=moving)
     return LinearRenderer(renderer, u, seed, tick)
 
 
-def lights_to_collect(renderer: Renderer) -> int:
+def count_lights(renderer: Renderer) -> int:
     """Return the number of lights that have a basis image; 1 where no light changes."""
-    moving = lighting(renderer)
-    if not moving.moved:
+    moving = find_lighting(renderer)
+    if not moving.changed_inputs:
         return 1
     inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-    return len(Lights(renderer, moving, inputs).alone)
+    return len(LightBasis(renderer, moving, inputs).inputs_of_light)
 
 
-def samples_to_collect(renderer: Renderer) -> int:
+def count_samples(renderer: Renderer) -> int:
     """Return the samples per pixel that are traced before anything can be predicted."""
     inputs: set[str] = set()
     for group in renderer.plan.groups:
         inputs |= renderer.routes.get(group.name, frozenset())
-    n_matrices = len(inputs & linear_inputs(renderer))
-    samples, n_passes = passes(renderer, SPP)
-    per_light = samples * n_passes * n_matrices if n_matrices else SPP
-    return lights_to_collect(renderer) * per_light
+    n_matrices = len(inputs & find_linear_inputs(renderer))
+    samples, n_passes = plan_passes(renderer, COLLECTED_SPP)
+    per_light = samples * n_passes * n_matrices if n_matrices else COLLECTED_SPP
+    return count_lights(renderer) * per_light

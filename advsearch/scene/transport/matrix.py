@@ -10,7 +10,7 @@ in the base color,
 
 and J is sparse: a pixel sees few texels directly, in a mirror or through glass
 (bilinear look-ups), and many a little (light from the object to the object), for which
-coarse cells of `COARSE` x `COARSE` texels are enough. What a pixel sees of the texels
+coarse cells of `CELL_SIZE` x `CELL_SIZE` texels are enough. What a pixel sees of the texels
 hardly depends on the color of the light, so that a row of J is stored as fractions of
 texels, which add up to one, times a color. A matrix that is one of many stores its
 fractions in 16 bits; one that serves a full search stores them in 32, by rows and by
@@ -33,12 +33,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from advsearch import seeds
-from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.assets import Floats, Ints
+from advsearch.scene.assembly import IMAGE_INPUTS
+from advsearch.scene.assets import Float32Array, IntArray
 from advsearch.scene.mitsuba_backend.denoise import denoise
-from advsearch.scene.mitsuba_backend.transport import Paths, Vertices, mean_of
-from advsearch.scene.parts import PATTERN
-from advsearch.scene.predictor import MOST_BYTES, LinearMap, Predictor
+from advsearch.scene.mitsuba_backend.transport import Paths, Vertices, average_passes
+from advsearch.scene.parts import PATTERN_SUFFIX
+from advsearch.scene.predictor import MAX_BYTES, LinearMap, Predictor
 from advsearch.scene.renderer import InputSpace, Renderer
 from advsearch.trust.stored_files import scaled
 
@@ -46,11 +46,11 @@ from advsearch.trust.stored_files import scaled
 Smooth = Callable[[Tensor], Tensor]
 # multiples of its mean at which an image is clipped; any exposure has clipped them long
 # before
-MOST_MEANS = 6e4
-COARSE = 8  # width of the cells of later vertices, in texels
+MAX_MEANS = 6e4
+CELL_SIZE = 8  # width of the cells of later vertices, in texels
 
 
-class Halves:
+class PackedImage:
     """An image, of any shape, stored in 16 bits per number.
 
     The numbers are multiples of its mean, so that the image may have any brightness.
@@ -61,11 +61,11 @@ class Halves:
             needs it in every step.
     """
 
-    def __init__(self, picture: Tensor, small: bool = True) -> None:
-        mean = float(picture.abs().mean()) if picture.numel() else 0.0
+    def __init__(self, image: Tensor, is_small: bool = True) -> None:
+        mean = float(image.abs().mean()) if image.numel() else 0.0
         self._scale = mean if 0.0 < mean < float("inf") else 1.0
-        self._values = (picture / self._scale).clamp(-MOST_MEANS, MOST_MEANS).half()
-        self._unpacked = None if small else self._values.float() * self._scale
+        self._values = (image / self._scale).clamp(-MAX_MEANS, MAX_MEANS).half()
+        self._unpacked = None if is_small else self._values.float() * self._scale
 
     def __call__(self) -> Tensor:
         """Return the image in float32."""
@@ -82,7 +82,7 @@ class _PackedRows(NamedTuple):
     row_starts: npt.NDArray[np.int32]
 
 
-class ColouredRows:
+class ColoredRows:
     """A sparse matrix (rows, columns) for three color channels.
 
     Its rows are fractions that add up to one, times a color. It is filled by `add`, and
@@ -103,8 +103,8 @@ class ColouredRows:
         self._packed: _PackedRows | None = None
         has_small_columns = small and columns <= 1 << 16
         self._column_type = np.dtype(np.uint16 if has_small_columns else np.int32)
-        self._colors: Floats = np.zeros((rows, 3), dtype=np.float32)
-        self._stored_colors = Halves(torch.zeros(0))
+        self._colors: Float32Array = np.zeros((rows, 3), dtype=np.float32)
+        self._stored_colors = PackedImage(torch.zeros(0))
 
     @property
     def bytes(self) -> int:
@@ -120,20 +120,26 @@ class ColouredRows:
             return packed
         return packed + 10 * self.entries + 12 * n_rows + 4 * n_columns
 
-    def add(self, rows: Ints, columns: Ints, shares: Floats, weights: Floats) -> None:
+    def add(
+        self,
+        rows: IntArray,
+        columns: IntArray,
+        fractions: Float32Array,
+        weights: Float32Array,
+    ) -> None:
         """Add entries.
 
         Args:
             rows: (n,) ascending.
             columns: (n, k) that take part in each; several may be the same.
-            shares: (n, k) fractions of the columns.
+            fractions: (n, k) fractions of the columns.
             weights: (n, 3) colors.
         """
         if not len(rows):
             return
         row_starts = np.searchsorted(rows, np.arange(self._shape[0] + 1))
         row_starts = row_starts * columns.shape[1]
-        values = (shares * np.abs(weights).mean(axis=1, keepdims=True)).ravel()
+        values = (fractions * np.abs(weights).mean(axis=1, keepdims=True)).ravel()
         added = scipy.sparse.csr_matrix(
             (values, columns.ravel().astype(np.int32), row_starts.astype(np.int32)),
             self._shape,
@@ -146,11 +152,11 @@ class ColouredRows:
                 rows, weights[:, channel], minlength=self._shape[0]
             )
 
-    def finish(self, picture: tuple[int, int], smooth: Smooth | None) -> None:
+    def finish(self, image_shape: tuple[int, int], smooth: Smooth | None) -> None:
         """Get ready to multiply.
 
         Args:
-            picture: height and width of the image whose pixels are the rows.
+            image_shape: height and width of the image whose pixels are the rows.
             smooth: removes the noise from the image of all rows' colors.
         """
         sums = np.asarray(self._sum.sum(axis=1)).ravel()
@@ -166,15 +172,15 @@ class ColouredRows:
             matrix = scipy.sparse.csr_matrix(
                 (fractions, self._sum.indices, self._sum.indptr), self._shape
             )
-            self._csr_pair = by_rows(matrix), by_rows(matrix.T.tocsr())
+            self._csr_pair = to_torch_csr(matrix), to_torch_csr(matrix.T.tocsr())
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
-        colors = torch.from_numpy(self._colors).reshape(*picture, 3)
+        colors = torch.from_numpy(self._colors).reshape(*image_shape, 3)
         if smooth is not None:
             colors = smooth(colors)
-        self._stored_colors = Halves(colors, self._small)
+        self._stored_colors = PackedImage(colors, self._small)
         self._colors = np.zeros((0, 3), dtype=np.float32)
 
-    def times(self, values: Tensor) -> Tensor:
+    def multiply(self, values: Tensor) -> Tensor:
         """Return the matrix times (columns, 3): (rows, 3)."""
         if self._csr_pair is not None:
             product = self._csr_pair[0] @ values
@@ -182,7 +188,7 @@ class ColouredRows:
             product = torch.from_numpy(self._unpack() @ values.numpy())
         return product.mul_(self._stored_colors().reshape(-1, 3))
 
-    def transposed_times(self, values: Tensor) -> Tensor:
+    def multiply_transposed(self, values: Tensor) -> Tensor:
         """Return the transposed matrix times (rows, 3): (columns, 3)."""
         colored = values * self._stored_colors().reshape(-1, 3)
         if self._csr_pair is not None:
@@ -202,7 +208,7 @@ class ColouredRows:
 class TextureTransport:
     """Linear map from a change of a base color to the change of radiance, and back.
 
-    It is filled by `add`, and then `finish` is called once.
+    It is filled by `add_pass`, and then `finish` is called once.
 
     Args:
         picture: height and width of the radiance in pixels.
@@ -211,19 +217,26 @@ class TextureTransport:
     """
 
     def __init__(
-        self, picture: tuple[int, int], texture: tuple[int, int], *, small: bool = False
+        self,
+        image_shape: tuple[int, int],
+        texture_shape: tuple[int, int],
+        *,
+        small: bool = False,
     ) -> None:
-        self._picture = picture
-        self._texture = texture
-        self._cells = (-(-texture[0] // COARSE), -(-texture[1] // COARSE))
-        cell_heights = _cell_sizes(texture[0], self._cells[0])
-        cell_widths = _cell_sizes(texture[1], self._cells[1])
+        self._picture = image_shape
+        self._texture = texture_shape
+        self._cells = (
+            -(-texture_shape[0] // CELL_SIZE),
+            -(-texture_shape[1] // CELL_SIZE),
+        )
+        cell_heights = _cell_sizes(texture_shape[0], self._cells[0])
+        cell_widths = _cell_sizes(texture_shape[1], self._cells[1])
         self._texels_in_cell = (cell_heights[:, None] * cell_widths[None, :])[
             :, :, None
         ]
-        n_pixels = picture[0] * picture[1]
-        self._first = ColouredRows(n_pixels, texture[0] * texture[1], small)
-        self._later = ColouredRows(n_pixels, self._cells[0] * self._cells[1], small)
+        n_pixels = image_shape[0] * image_shape[1]
+        self._first = ColoredRows(n_pixels, texture_shape[0] * texture_shape[1], small)
+        self._later = ColoredRows(n_pixels, self._cells[0] * self._cells[1], small)
 
     @property
     def entries(self) -> int:
@@ -233,24 +246,24 @@ class TextureTransport:
     def bytes(self) -> int:
         return self._first.bytes + self._later.bytes
 
-    def add(self, vertices: Sequence[Vertices], share: float) -> None:
+    def add_pass(self, vertices: Sequence[Vertices], fraction: float) -> None:
         """Add a pass of paths.
 
         Args:
             vertices: by their index in the path.
-            share: the fraction of all samples that the pass has.
+            fraction: the fraction of all samples that the pass has.
         """
         n_rows, n_columns = self._cells
         for vertex in vertices:
-            sharp = vertex.only(vertex.sharp)
-            texels, fractions = bilinear(sharp.uv.numpy(), self._texture)
+            sharp = vertex.select(vertex.is_sharp)
+            texels, fractions = find_bilinear_weights(sharp.uv.numpy(), self._texture)
             self._first.add(
                 sharp.pixel.numpy(),
                 texels.astype(np.int64),
                 fractions,
-                sharp.weight.numpy() * np.float32(share),
+                sharp.weight.numpy() * np.float32(fraction),
             )
-            scattered = vertex.only(~vertex.sharp)
+            scattered = vertex.select(~vertex.is_sharp)
             uv = scattered.uv.numpy() % 1.0
             column = np.floor(uv[:, 0] * n_columns).astype(np.int64)
             row = np.floor(uv[:, 1] * n_rows).astype(np.int64)
@@ -260,7 +273,7 @@ class TextureTransport:
                 scattered.pixel.numpy(),
                 cell,
                 np.ones_like(cell, dtype=np.float32),
-                scattered.weight.numpy() * np.float32(share),
+                scattered.weight.numpy() * np.float32(fraction),
             )
 
     def finish(self, smooth: Smooth | None = None) -> None:
@@ -279,43 +292,47 @@ class TextureTransport:
 
         That is (h, w, 3); the result is differentiable.
         """
-        radiance: Tensor = LinearMap.apply(self.times, self.transposed_times, change)  # type: ignore[no-untyped-call]
+        radiance: Tensor = LinearMap.apply(
+            self.multiply, self.multiply_transposed, change
+        )  # type: ignore[no-untyped-call]
         return radiance
 
-    def times(self, change: Tensor) -> Tensor:
+    def multiply(self, change: Tensor) -> Tensor:
         """Return J times (h, w, 3), as (H, W, 3)."""
         n_rows, n_columns = self._cells
-        bottom = COARSE * n_rows - self._texture[0]
-        right = COARSE * n_columns - self._texture[1]
+        bottom = CELL_SIZE * n_rows - self._texture[0]
+        right = CELL_SIZE * n_columns - self._texture[1]
         padded = change
         if right or bottom:
             padded = functional.pad(change, (0, 0, 0, right, 0, bottom))
-        row_sums = padded.reshape(n_rows * COARSE, n_columns, COARSE, 3).sum(dim=2)
-        cell_sums = row_sums.reshape(n_rows, COARSE, n_columns, 3).sum(dim=1)
+        row_sums = padded.reshape(n_rows * CELL_SIZE, n_columns, CELL_SIZE, 3).sum(
+            dim=2
+        )
+        cell_sums = row_sums.reshape(n_rows, CELL_SIZE, n_columns, 3).sum(dim=1)
         pooled = cell_sums / self._texels_in_cell
-        radiance = self._first.times(change.reshape(-1, 3)).add_(
-            self._later.times(pooled.reshape(-1, 3))
+        radiance = self._first.multiply(change.reshape(-1, 3)).add_(
+            self._later.multiply(pooled.reshape(-1, 3))
         )
         return radiance.reshape(*self._picture, 3)
 
-    def transposed_times(self, cotangent: Tensor) -> Tensor:
+    def multiply_transposed(self, cotangent: Tensor) -> Tensor:
         """Return the transpose of J times (H, W, 3), as (h, w, 3)."""
         flat = cotangent.reshape(-1, 3)
-        first = self._first.transposed_times(flat).reshape(*self._texture, 3)
-        later = self._later.transposed_times(flat).reshape(*self._cells, 3)
+        first = self._first.multiply_transposed(flat).reshape(*self._texture, 3)
+        later = self._later.multiply_transposed(flat).reshape(*self._cells, 3)
         later = later / self._texels_in_cell
-        spread = later[:, None, :, None].expand(-1, COARSE, -1, COARSE, -1)
-        spread = spread.reshape(self._cells[0] * COARSE, -1, 3)
+        spread = later[:, None, :, None].expand(-1, CELL_SIZE, -1, CELL_SIZE, -1)
+        spread = spread.reshape(self._cells[0] * CELL_SIZE, -1, 3)
         return first + spread[: self._texture[0], : self._texture[1]]
 
 
 def _cell_sizes(n_texels: int, n_cells: int) -> Tensor:
     """Return how many texels each cell has along one axis; the last may have fewer."""
-    first_texels = COARSE * torch.arange(n_cells)
-    return (n_texels - first_texels).clamp(max=COARSE).float()
+    first_texels = CELL_SIZE * torch.arange(n_cells)
+    return (n_texels - first_texels).clamp(max=CELL_SIZE).float()
 
 
-def by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
+def to_torch_csr(matrix: scipy.sparse.csr_matrix) -> Tensor:
     """Convert a sparse matrix to torch, whose products are twice as fast as scipy's."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
@@ -328,9 +345,9 @@ def by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
         )
 
 
-def bilinear(
-    uv: Floats, texture: tuple[int, int]
-) -> tuple[npt.NDArray[np.int32], Floats]:
+def find_bilinear_weights(
+    uv: Float32Array, texture: tuple[int, int]
+) -> tuple[npt.NDArray[np.int32], Float32Array]:
     """Return the four texels of each bilinear look-up, and their fractions.
 
     The look-up repeats at the border.
@@ -343,8 +360,8 @@ def bilinear(
         (n, 4) indices in the flat texture, and (n, 4) fractions.
     """
     height, width = texture
-    columns, column_fractions = _linear(uv[:, 0] * width - 0.5, width)
-    rows, row_fractions = _linear(uv[:, 1] * height - 0.5, height)
+    columns, column_fractions = _find_linear_weights(uv[:, 0] * width - 0.5, width)
+    rows, row_fractions = _find_linear_weights(uv[:, 1] * height - 0.5, height)
     texels = [row * width + column for row in rows for column in columns]
     fractions = [
         row_fraction * column_fraction
@@ -354,35 +371,41 @@ def bilinear(
     return np.stack(texels, axis=1), np.stack(fractions, axis=1)
 
 
-def _linear(
-    position: Floats, count: int
-) -> tuple[list[npt.NDArray[np.int32]], list[Floats]]:
+def _find_linear_weights(
+    position: Float32Array, count: int
+) -> tuple[list[npt.NDArray[np.int32]], list[Float32Array]]:
     """Return the two neighbours of positions among `count`, and their fractions."""
     first = np.floor(position).astype(np.int32)
     fraction = (position - np.floor(position)).astype(np.float32)
     return [first % count, (first + 1) % count], [1.0 - fraction, fraction]
 
 
-SPP = 128
+COLLECTED_SPP = 128
 """Samples per pixel of the paths that make the matrix and the base image.
 
 The noise that the denoiser leaves in the base image is in all predicted images.
 """
-PASS = 2**20  # samples of all pixels in one pass; its vertices are held in memory
-MOST = 4.0  # largest factor by which the noise of the base image corrects a row
+SAMPLES_PER_PASS = (
+    2**20
+)  # samples of all pixels in one pass; its vertices are held in memory
+MAX_CORRECTION = (
+    4.0  # largest factor by which the noise of the base image corrects a row
+)
 TOO_LARGE = "the matrix would take more than"
-LINEAR = (".base_color", PATTERN)
+LINEAR_SUFFIXES = (".base_color", PATTERN_SUFFIX)
 """Ends of names of inputs to which radiance is linear.
 
 That is but for light that meets a base color twice.
 """
 
 Inputs = Mapping[str, Tensor]
-SomeNames = Collection[str] | None
-Tick = Callable[[int], None]  # called with samples per pixel as they are traced
+OptionalNames = Collection[str] | None
+ProgressCallback = Callable[
+    [int], None
+]  # called with samples per pixel as they are traced
 
 
-def untold(samples: int) -> None:
+def ignore_progress(samples: int) -> None:
     """Ignore progress: the default of what is called with samples per pixel."""
 
 
@@ -391,14 +414,14 @@ class TransportTooLargeError(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class Linearised:
+class LinearizedScene:
     """What a `LinearRenderer` has collected; it can be sent to another process."""
 
     transports: Mapping[str, TextureTransport]  # by input, finished
-    there: dict[str, Tensor]  # the inputs where it was linearised
-    applied: Inputs  # those that belong to the finished image, not to the scene
+    linearized_at: dict[str, Tensor]  # the inputs where it was linearised
+    image_inputs: Inputs  # those that belong to the finished image, not to the scene
     # the image there, linear radiance, and coverage where there is a backdrop
-    base: Halves
+    base_image: PackedImage
     non_finite: int = 0  # values that were not finite
 
 
@@ -421,7 +444,7 @@ class LinearRenderer(Predictor):
             traced.
 
     Raises:
-        TransportTooLargeError: a matrix would take more than `MOST_BYTES`.
+        TransportTooLargeError: a matrix would take more than `MAX_BYTES`.
     """
 
     def __init__(
@@ -429,79 +452,81 @@ class LinearRenderer(Predictor):
         traced: Renderer,
         u: Tensor,
         seed: int,
-        tick: Tick = untold,
+        tick: ProgressCallback = ignore_progress,
         *,
-        spp: int = SPP,
+        spp: int = COLLECTED_SPP,
         quick: bool = False,
-        names: SomeNames = None,
+        names: OptionalNames = None,
         light: Inputs = MappingProxyType({}),
-        collected: Linearised | None = None,
+        collected: LinearizedScene | None = None,
     ) -> None:
         super().__init__(traced)
         if collected is None:
             with torch.no_grad():
                 collected = _collect(
-                    traced.like(), u, seed, tick, spp, quick, names, light
+                    traced.copy_with(), u, seed, tick, spp, quick, names, light
                 )
         self.collected = collected
         self.non_finite = collected.non_finite
-        self.there = collected.there
+        self.linearized_at = collected.linearized_at
 
     @property
-    def entries(self) -> int:
+    def n_entries(self) -> int:
         transports = self.collected.transports.values()
         return sum(transport.entries for transport in transports)
 
     @property
-    def bytes(self) -> int:
-        height, width = self.traced.formation.resolution
+    def n_bytes(self) -> int:
+        height, width = self.path_renderer.formation.resolution
         transports = self.collected.transports.values()
         return sum(transport.bytes for transport in transports) + 8 * height * width
 
-    def let_go(self, space: InputSpace) -> None:
+    def release_scene(self, space: InputSpace) -> None:
         """Release the scene, which only tracing needs; the images stay.
 
         `space` is the same space without a scene.
         """
-        self.traced = self.traced.like()
-        del self.traced.scene
-        self.traced.space = space
+        self.path_renderer = self.path_renderer.copy_with()
+        del self.path_renderer.scene
+        self.path_renderer.space = space
 
-    def radiance(self, inputs: Inputs) -> Tensor:
-        base = self.collected.base()
+    def predict_radiance(self, inputs: Inputs) -> Tensor:
+        base = self.collected.base_image()
         radiance = base[..., :3]
         for name, transport in self.collected.transports.items():
-            radiance = radiance + transport(inputs[name] - self.there[name])
+            radiance = radiance + transport(inputs[name] - self.linearized_at[name])
         if base.shape[-1] == 3:
             return radiance
         return torch.cat([radiance, base[..., 3:]], dim=-1)
 
-    def shown(self, inputs: Inputs, u: Tensor) -> Tensor:
+    def predict_image(self, inputs: Inputs, u: Tensor) -> Tensor:
         """Return the image (H, W, 3) sRGB of scene inputs.
 
         Only inputs to which radiance is linear count; what controls do to the finished
         image comes from `u`.
         """
-        return self.traced.finished(self.radiance(inputs), self.collected.applied, u)
+        return self.path_renderer.finish_image(
+            self.predict_radiance(inputs), self.collected.image_inputs, u
+        )
 
 
 def _collect(
     renderer: Renderer,
     u: Tensor,
     seed: int,
-    tick: Tick,
+    tick: ProgressCallback,
     spp: int,
     quick: bool,
-    names: SomeNames,
+    names: OptionalNames,
     light: Inputs,
-) -> Linearised:
+) -> LinearizedScene:
     """Trace what a `LinearRenderer` needs; arguments as there."""
     non_finite_before = renderer.non_finite
     inputs = renderer.scene.assembly(renderer.space.inputs(u))
-    applied = {name: value for name, value in inputs.items() if name in ON_PICTURE}
-    traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+    applied = {name: value for name, value in inputs.items() if name in IMAGE_INPUTS}
+    traced = {name: value for name, value in inputs.items() if name not in IMAGE_INPUTS}
     traced |= dict(light)
-    linear = linear_inputs(renderer) if names is None else names
+    linear = find_linear_inputs(renderer) if names is None else names
     there = {name: value.clone() for name, value in traced.items() if name in linear}
     transports = {
         name: TextureTransport(
@@ -513,22 +538,22 @@ def _collect(
     }
     hide = "backdrop.color" in applied
     if not transports:
-        base = renderer.rendered(traced, seed, spp, hide)
+        base = renderer.render_radiance(traced, seed, spp, hide)
         tick(spp)
     else:
         paths = _fill_transports(renderer, transports, traced, seed, tick, spp)
         radiance = paths.radiance - paths.background if hide else paths.radiance
-        radiance = renderer.finite(radiance)
+        radiance = renderer.replace_non_finite(radiance)
         base, smooth = _make_smooth(renderer, radiance, paths, quick)
         for transport in transports.values():
             transport.finish(smooth)
         if hide:
             base = torch.cat([base, paths.coverage], dim=-1)
-    return Linearised(
+    return LinearizedScene(
         transports=transports,
-        there=there,
-        applied=applied,
-        base=Halves(base, small=quick),
+        linearized_at=there,
+        image_inputs=applied,
+        base_image=PackedImage(base, is_small=quick),
         non_finite=renderer.non_finite - non_finite_before,
     )
 
@@ -538,26 +563,26 @@ def _fill_transports(
     transports: Mapping[str, TextureTransport],
     traced: Inputs,
     seed: int,
-    tick: Tick,
+    tick: ProgressCallback,
     spp: int,
 ) -> Paths:
     """Trace paths for each matrix and add them; return the mean images of all."""
-    samples, n_passes = passes(renderer, spp)
+    samples, n_passes = plan_passes(renderer, spp)
     height, width = renderer.formation.resolution
     images: list[Paths] = []
     for name, transport in transports.items():
         for index in range(n_passes):
             noise_seed = seeds.stream(seed, f"transport {name}", index)
-            paths = renderer.scene.transport(traced, name, noise_seed, samples)
-            transport.add(paths.vertices, 1.0 / n_passes)
+            paths = renderer.scene.collect_paths(traced, name, noise_seed, samples)
+            transport.add_pass(paths.vertices, 1.0 / n_passes)
             size = sum(filled.bytes for filled in transports.values())
-            if size + 8 * height * width > scaled(MOST_BYTES):
+            if size + 8 * height * width > scaled(MAX_BYTES):
                 raise TransportTooLargeError(
-                    f"{TOO_LARGE} {scaled(MOST_BYTES) / 2**30:g} GiB"
+                    f"{TOO_LARGE} {scaled(MAX_BYTES) / 2**30:g} GiB"
                 )
             images.append(replace(paths, vertices=[]))
             tick(samples)
-    return mean_of(images)
+    return average_passes(images)
 
 
 def _make_smooth(
@@ -570,7 +595,9 @@ def _make_smooth(
     if renderer.formation.denoiser != "oidn":
         return radiance, None
     clean = denoise(radiance, paths.albedo.clamp(0.0, 1.0), paths.normal)
-    ratio = (clean / radiance.clamp_min(1e-12)).clamp(1.0 / MOST, MOST)
+    ratio = (clean / radiance.clamp_min(1e-12)).clamp(
+        1.0 / MAX_CORRECTION, MAX_CORRECTION
+    )
     is_surface = paths.albedo.sum(dim=-1, keepdim=True) > 0.0
     even_albedo = is_surface.to(torch.float32).expand(-1, -1, 3).contiguous()
 
@@ -582,13 +609,15 @@ def _make_smooth(
     return clean, smooth
 
 
-def linear_inputs(renderer: Renderer) -> frozenset[str]:
+def find_linear_inputs(renderer: Renderer) -> frozenset[str]:
     """Return the names of a scene's inputs to which radiance is linear."""
-    return frozenset(name for name in renderer.scene.names if name.endswith(LINEAR))
+    return frozenset(
+        name for name in renderer.scene.input_names if name.endswith(LINEAR_SUFFIXES)
+    )
 
 
-def passes(renderer: Renderer, spp: int) -> tuple[int, int]:
+def plan_passes(renderer: Renderer, spp: int) -> tuple[int, int]:
     """Return the samples per pixel of a pass, and the number of passes."""
     height, width = renderer.formation.resolution
-    samples = max(1, min(spp, PASS // (height * width)))
+    samples = max(1, min(spp, SAMPLES_PER_PASS // (height * width)))
     return samples, -(-spp // samples)

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Query, Random, SearchResult, search
-from advsearch.attacks.evaluation import Policy, one_thread, seeded
-from advsearch.attacks.policies.auto import LOW, make_plan
-from advsearch.attacks.policies.surrogate import box_coordinates, fit
+from advsearch.attacks.evaluation import Policy, seeded, use_one_thread
+from advsearch.attacks.policies.auto import LOW_DIM, make_plan
+from advsearch.attacks.policies.surrogate import find_box_coordinates, fit
 from covering import once_each
 
 POSE = (Block(3, name="position"), Block(3, periodic=True, name="rotation"))
@@ -184,17 +184,17 @@ def test_the_screen_is_half_of_a_box_and_gradients_by_differences_are_never_wort
 def test_free_gradients_end_a_search_and_lead_one_in_many_dimensions() -> None:
     few, problem = played(domain_of(POSE), Auto(), 40)
     assert [bool(g) for g in problem.asked[:40]] == [False] * 30 + [True] * 9 + [False]
-    many = domain_of((Block(3 * LOW),))
-    plan = make_plan(many, box_coordinates(many), 60)
-    assert (plan.screen, plan.until, plan.gradient) == (10, 10, True)
+    many = domain_of((Block(3 * LOW_DIM),))
+    plan = make_plan(many, find_box_coordinates(many), 60)
+    assert (plan.screen, plan.ascent_start, plan.gradient) == (10, 10, True)
     assert few.gradients == 9
 
 
 def test_a_texture_beside_a_pose_takes_free_gradients_where_there_are_some() -> None:
     for cost, free, wanted in ((12, True, "free"), (12, False, True), (0, True, True)):
         domain = domain_of((BALL, *POSE), cost, free)
-        plan = make_plan(domain, box_coordinates(domain), 40)
-        assert (plan.screen, plan.until, plan.gradient) == (10, 20, wanted)
+        plan = make_plan(domain, find_box_coordinates(domain), 40)
+        assert (plan.screen, plan.ascent_start, plan.gradient) == (10, 20, wanted)
     result, problem = played(domain_of((BALL, *POSE), 12, True), Auto(), 40)
     balls = torch.stack(problem.seen)[:, :40]
     assert bool((balls[:20] == problem.domain.start[:40]).all())
@@ -236,19 +236,19 @@ def test_an_angle_is_searched_across_its_seam() -> None:
 
 def test_coordinates_go_to_the_box_and_back() -> None:
     domain = domain_of((BALL, Block(2, low=0.25, high=0.75), CHOICE, Block(1, periodic=True)))
-    box = box_coordinates(domain)
+    box = find_box_coordinates(domain)
     assert box.where.tolist() == [40, 41, 42, 43]
     x = torch.tensor([0.0, 1.0, 0.375, 0.9])
-    u = box.put(domain.start, x)
+    u = box.to_configuration(domain.start, x)
     assert torch.allclose(u[40:], torch.tensor([0.25, 0.75, 0.375, 0.9]))
     assert torch.equal(u[:40], domain.start[:40])
-    assert torch.allclose(box.take(u), x)
-    tidy = box.tidy(torch.tensor([[-1.0, 2.0, 0.3, 1.25]]))
+    assert torch.allclose(box.from_configuration(u), x)
+    tidy = box.normalize(torch.tensor([[-1.0, 2.0, 0.3, 1.25]]))
     assert torch.allclose(tidy, torch.tensor([[0.0, 1.0, 0.375, 0.25]]))
 
 
 def test_distances_know_angles_and_choices() -> None:
-    box = box_coordinates(domain_of((Block(1), Block(1, periodic=True), CHOICE)))
+    box = find_box_coordinates(domain_of((Block(1), Block(1, periodic=True), CHOICE)))
 
     def distance(a: list[float], b: list[float]) -> float:
         points = box.embed(torch.tensor([a, b]), torch.ones(3).double())
@@ -261,12 +261,12 @@ def test_distances_know_angles_and_choices() -> None:
 
 
 def test_the_surrogate_predicts_what_it_has_not_seen_and_averages_noise() -> None:
-    box = box_coordinates(domain_of((Block(2),)))
-    x = box.screen(3, 60)
+    box = find_box_coordinates(domain_of((Block(2),)))
+    x = box.sample_screen(3, 60)
     y = torch.sin(5 * x[:, 0]) + 0.2 * torch.randn(60, generator=seeded(0, 0))
-    with one_thread():
+    with use_one_thread():
         surrogate = fit(box, x, y)
-    new = box.screen(4, 200)
+    new = box.sample_screen(4, 200)
     mean, deviation = surrogate.predict(new)
     error = (mean - torch.sin(5 * new[:, 0])).square().mean().sqrt()
     assert float(error) < 0.12  # well under the noise of 0.2

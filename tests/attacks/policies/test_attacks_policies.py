@@ -261,13 +261,18 @@ def test_over_drawn_conditions_the_step_of_pgd_falls_in_a_line_whatever_they_wer
             return Evaluation(float(query.u[0]), None, False)
         return Evaluation(-float(query.number), torch.ones(2), False)
 
-    domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),), drawn=True)
+    domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),), draws_conditions=True)
     result = search(partial(map, evaluate), domain, PGD(step_size=0.02), steps=STEPS, seed=0, candidates=3)
     sizes = [record.step_size for record in result.history]
     assert sizes == pytest.approx([0.02 * max(0.05, 1 - number / STEPS) for number in range(STEPS)])
     assert float(result.best_u[0]) == max(float(u[0]) for u in ranking) > 0.55
     usual = search(
-        partial(map, evaluate), replace(domain, drawn=False), PGD(step_size=0.02), steps=STEPS, seed=0, candidates=3
+        partial(map, evaluate),
+        replace(domain, draws_conditions=False),
+        PGD(step_size=0.02),
+        steps=STEPS,
+        seed=0,
+        candidates=3,
     )
     assert float(usual.best_u[0]) < 0.55
 

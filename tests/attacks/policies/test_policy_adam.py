@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Adam, Block, Domain, Ending, Evaluation, Query, search
-from advsearch.attacks.domain import half_widths
+from advsearch.attacks.domain import compute_half_widths
 
 
 def path(domain: Domain, slope: Tensor, policy: Adam, steps: int) -> list[Tensor]:
@@ -50,7 +50,7 @@ def test_half_widths_are_the_units() -> None:
         (Block(2, "linf", 0.1), Block(2, "l2", 0.2), Block(1, low=0.2, high=0.8), Block(1, reach=0.1)),
     )
     expected = [0.1, 0.075, 0.2 / math.sqrt(2), 0.2 / math.sqrt(2), 0.3, 0.1]
-    assert half_widths(domain).tolist() == pytest.approx(expected)
+    assert compute_half_widths(domain).tolist() == pytest.approx(expected)
 
 
 def test_the_rate_falls_in_a_line() -> None:

@@ -108,7 +108,7 @@ def test_three_times_as_many_cells_fail_as_in_random_search(scene: str) -> None:
 )
 def test_parameters_have_names_and_a_choice_has_its_options(over: str, places: list[int]) -> None:
     state = started(NAMED, over=over, cells=7)
-    assert state.spanned.tolist() == places
+    assert state.measure_indices.tolist() == places
     assert list(state.archive.dims) == [3 if place == 4 else 7 for place in places]
 
 
@@ -136,7 +136,7 @@ def test_a_generation_is_of_different_cells_and_goes_where_nothing_fails_yet() -
         before, state = state, policy.update(state, told)
     last = (before.points[:, 0] * 20).int().tolist()
     assert len(set(last)) >= 4 and bool((before.points[:, 1] > 0.7).sum() >= 4)
-    assert policy.failures(state).found >= 19
+    assert policy.failures(state).n_failures >= 19
 
 
 @pytest.mark.parametrize("blocks", [(Block(17),), (Block(2), Block(3, norm="l2", epsilon=0.1))])
@@ -144,7 +144,7 @@ def test_many_numbers_and_norm_balls_have_no_surrogate(blocks: tuple[Block, ...]
     policy = MapElites()
     domain = Domain(torch.full((sum(one.size for one in blocks),), 0.5), blocks)
     state = policy.start(domain, torch.Generator().manual_seed(0), 100)
-    assert state.seen is None
+    assert state.observations is None
     after = policy.update(state, [(u, Evaluation(float(u[0]), None, False)) for u in state.points])
     assert after.points.shape == state.points.shape and all(domain.contains(u) for u in after.points)
 
@@ -197,10 +197,10 @@ def test_failing_cells_are_told_with_their_ends_and_those_of_a_generation_that_i
     state = replace(state, points=torch.stack([*points, points[0]]))
     told = [(u, Evaluation(v, None, v > 1.5)) for u, v in zip(points, [2.0, 3.0, 1.0, 4.0], strict=True)]
     known = policy.failures(policy.update(state, told))
-    assert (known.over, known.found, known.seen, known.places) == ((0, 1), 2, 3, 8)
-    assert [one.objective for one in known.listed] == [4.0, 3.0]
-    assert known.listed[1].u.tolist() == pytest.approx([0.2, 0.25])
-    assert [one.ranges for one in known.listed] == [{0: (0.75, 1.0), 1: (0.5, 1.0)}, {0: (0.0, 0.25), 1: (0.0, 0.5)}]
+    assert (known.over, known.n_failures, known.n_visited, known.n_cells) == ((0, 1), 2, 3, 8)
+    assert [one.objective for one in known.examples] == [4.0, 3.0]
+    assert known.examples[1].u.tolist() == pytest.approx([0.2, 0.25])
+    assert [one.ranges for one in known.examples] == [{0: (0.75, 1.0), 1: (0.5, 1.0)}, {0: (0.0, 0.25), 1: (0.0, 0.5)}]
 
 
 @pytest.mark.parametrize("around", ["restarts", "portfolio"])
@@ -212,5 +212,5 @@ def test_around_an_archive_its_failures_are_still_told(around: str) -> None:
 
     domain = Domain(torch.full((2,), 0.5), (Block(2),))
     found = search(partial(map, evaluate), domain, make_policy(around, **inner), steps=120, seed=0).failures
-    assert found is not None and found.found > 2
+    assert found is not None and found.n_failures > 2
     assert search(partial(map, evaluate), domain, make_policy("nes"), steps=20, seed=0).failures is None

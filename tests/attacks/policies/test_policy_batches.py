@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import POLICIES, Block, Domain, Evaluation, Policy, make_policy
-from advsearch.attacks.policies.choices import with_choices
+from advsearch.attacks.policies.choices import wrap_choices
 from covering import once_each
 
 NUMBERS = Domain(torch.tensor([0.3, 0.6, 0.5, 0.5]), (Block(2), Block(2, "linf", 0.2)))
@@ -40,7 +40,7 @@ def worth(u: Tensor, gradient: object, samples: int, cost: int) -> Evaluation:
 
 def proposed(policy: Policy[Any], domain: Domain, n: int) -> tuple[list[tuple[Any, ...]], list[int]]:
     """Return what was proposed until the renders were spent, and the sizes of the batches."""
-    policy = with_choices(policy, domain)
+    policy = wrap_choices(policy, domain)
     state = policy.start(domain, torch.Generator().manual_seed(3), STEPS)
     seen: list[tuple[Any, ...]] = []
     sizes, spent = [], 0
@@ -72,7 +72,7 @@ def test_of_a_batch_that_is_cut_the_first_count(policy: str) -> None:
     one; and it can be asked for more."""
 
     def known(n: int, most: int) -> tuple[Any, ...]:
-        one = with_choices(FORMS[policy], CHOICES)
+        one = wrap_choices(FORMS[policy], CHOICES)
         state, told = one.start(CHOICES, torch.Generator().manual_seed(3), STEPS), 0
         while told < most:
             proposals, state = one.propose(state, n)
@@ -84,7 +84,8 @@ def test_of_a_batch_that_is_cut_the_first_count(policy: str) -> None:
         return (
             one.counts(state),
             answer and (answer.mean.tolist(), answer.deviation.tolist()),
-            failures and (failures.found, failures.seen, [failure.objective for failure in failures.listed]),
+            failures
+            and (failures.n_failures, failures.n_visited, [failure.objective for failure in failures.examples]),
         )
 
     assert known(8, 11) == known(1, 11)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
-from advsearch.attacks.candidates import Failures, FailureShare, failure_share
-from advsearch.attacks.evaluation import one_thread
+from advsearch.attacks.candidates import FailureRate, Failures, estimate_failure_rate
+from advsearch.attacks.evaluation import use_one_thread
 from advsearch.errors import InputError
 
 BOX = Domain(
@@ -55,9 +55,9 @@ def learnt(margin: Margin, seed: int, renders: int = 400) -> Failures:
     return found
 
 
-def share(known: Failures) -> FailureShare:
-    assert known.share is not None
-    return known.share
+def share(known: Failures) -> FailureRate:
+    assert known.failure_rate is not None
+    return known.failure_rate
 
 
 @pytest.mark.medium
@@ -75,12 +75,12 @@ def test_its_share_is_the_true_one_with_less_error_than_even_draws(margin: Margi
 @pytest.mark.medium
 def test_it_answers_with_a_failure_for_each_place_and_what_tells_it_apart() -> None:
     known = learnt(two, 1)
-    assert known.found > 5 * 0.02 * known.seen and known.places is None
-    heights = [float(one.u[1]) for one in known.listed]
-    assert all(two(one.u) > 0.0 for one in known.listed)
+    assert known.n_failures > 5 * 0.02 * known.n_visited and known.n_cells is None
+    heights = [float(one.u[1]) for one in known.examples]
+    assert all(two(one.u) > 0.0 for one in known.examples)
     assert min(heights) < 0.2 and max(heights) > 0.8
-    assert all(set(one.ranges) == {1, 2} for one in known.listed)
-    (options,) = {one.ranges.get(3) for one in learnt(across, 0).listed}
+    assert all(set(one.ranges) == {1, 2} for one in known.examples)
+    (options,) = {one.ranges.get(3) for one in learnt(across, 0).examples}
     assert options == (0.75, 1.0)
 
 
@@ -96,8 +96,8 @@ def test_an_interval_covers_as_often_as_it_says() -> None:
         density = torch.where(x < 0.2, 1.0 - often + 5.0 * often, 1.0 - often)
         x[:50], density[:50] = even[:50], 1.0
         bounds = torch.cat([torch.ones(50), torch.full((100,), 1.0 / (1.0 - often))])
-        with one_thread():
-            told = failure_share(1.0 / density, bounds, x < truth, torch.zeros(150, dtype=torch.bool))
+        with use_one_thread():
+            told = estimate_failure_rate(1.0 / density, bounds, x < truth, torch.zeros(150, dtype=torch.bool))
         missed += not told.interval[0] <= truth <= told.interval[1]
     assert missed <= 5
 
@@ -106,15 +106,15 @@ def test_nothing_is_estimated_from_few_failures_and_what_is_unknown_widens_the_i
     weights, none = torch.ones(100), torch.zeros(100, dtype=torch.bool)
     few = none.clone()
     few[:5] = True
-    told = failure_share(weights, weights, few, none)
+    told = estimate_failure_rate(weights, weights, few, none)
     assert told.estimate is None and told.effective == pytest.approx(5.0)
     assert told.interval[0] < 0.05 < told.interval[1] < 0.2
     unknown = none.clone()
     unknown[50:] = True
-    wide = failure_share(weights, weights, few, unknown)
+    wide = estimate_failure_rate(weights, weights, few, unknown)
     assert wide.interval[0] == pytest.approx(told.interval[0]) and wide.interval[1] > 0.55
-    assert failure_share(weights, weights, none, none).interval == pytest.approx((0.0, 0.05), abs=0.04)
-    assert failure_share(weights, weights, ~none, none).interval[1] == 1.0
+    assert estimate_failure_rate(weights, weights, none, none).interval == pytest.approx((0.0, 0.05), abs=0.04)
+    assert estimate_failure_rate(weights, weights, ~none, none).interval[1] == 1.0
 
 
 def test_options_that_no_search_can_have_are_refused() -> None:
@@ -133,4 +133,4 @@ def test_no_share_is_told_of_a_ball_whose_draws_are_projected() -> None:
         return Evaluation(float(query.u[0]), None, bool(query.u[0] > 0.55))
 
     known = search(partial(map, evaluate), domain, make_policy("mixture"), steps=60, seed=0, candidates=0).failures
-    assert known is not None and known.share is None and known.found > 0
+    assert known is not None and known.failure_rate is None and known.n_failures > 0

@@ -36,7 +36,7 @@ from advsearch.attacks import (
     seeded,
 )
 from advsearch.attacks.policies import choices
-from advsearch.attacks.policies.choices import MOST, with_choices
+from advsearch.attacks.policies.choices import MOST, wrap_choices
 from advsearch.errors import InputError, UnknownNameError
 
 BOX = Domain(torch.tensor([0.3, 0.6]), (Block(2),))
@@ -104,7 +104,7 @@ def test_rounds(n: int, rounds: int) -> None:
 
 @pytest.mark.parametrize(("steps", "each", "limit"), [(1, 1, 9), (40, 1, 999), (40, 13, 9), (1000, 1, 64), (39, 2, 8)])
 def test_as_many_run_as_can_have_a_whole_evaluation_in_every_round(steps: int, each: int, limit: int) -> None:
-    n = choices.most_runners(steps, each, limit)
+    n = choices.max_runners(steps, each, limit)
     assert 1 <= n <= limit
     assert n == 1 or n * choices.count_rounds(n) * each <= steps
     assert n == limit or (n + 1) * choices.count_rounds(n + 1) * each > steps
@@ -168,11 +168,11 @@ def test_renders_that_gradients_did_not_take_are_for_the_rounds_to_come() -> Non
 def test_what_is_affordable() -> None:
     domain = replace(BOX, gradient_cost=3)
     wanted = Proposal(BOX.start, gradient=True, samples=2)
-    assert wanted.affordable(domain, 9) is wanted
-    assert wanted.affordable(domain, 8).gradient is False
-    assert wanted.affordable(domain, 1).samples == 1
+    assert wanted.limit_cost(domain, 9) is wanted
+    assert wanted.limit_cost(domain, 8).gradient is False
+    assert wanted.limit_cost(domain, 1).samples == 1
     free = Proposal(BOX.start, gradient="free", samples=2)
-    assert (free.cost(domain), free.affordable(domain, 3).gradient, free.affordable(domain, 2).gradient) == (
+    assert (free.max_cost(domain), free.limit_cost(domain, 3).gradient, free.limit_cost(domain, 2).gradient) == (
         2,
         "free",
         False,
@@ -288,9 +288,9 @@ def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:
 def test_who_handles_choices_is_left_alone() -> None:
     choosy = Domain(torch.tensor([0.1, 0.5]), (Block(1, options=3), Block(1)))
     for policy in (Auto(), Random(), Portfolio()):
-        assert with_choices(policy, choosy) is policy
-    assert with_choices(PGD(), choosy) == Choices(PGD())
-    assert with_choices(PGD(), BOX) == PGD()
+        assert wrap_choices(policy, choosy) is policy
+    assert wrap_choices(PGD(), choosy) == Choices(PGD())
+    assert wrap_choices(PGD(), BOX) == PGD()
 
 
 # ---- names

@@ -28,7 +28,7 @@ import small_models
 from advsearch.api import workbench
 from advsearch.cli.main import main
 from advsearch.cluster import InProcess
-from advsearch.engine.image_changes import CHANGED
+from advsearch.engine.image_changes import IMAGE_CHANGES
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
 from advsearch.models.model import ModelWarning
@@ -36,24 +36,24 @@ from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.report.evidence import claims_of
-from advsearch.questions.report.recorded import made_with, recorded_settings
+from advsearch.questions.report.evidence import collect_claims
+from advsearch.questions.report.recorded import collect_settings, collect_versions
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.test import claims
 from advsearch.questions.test import result as words
 from advsearch.questions.test.counterexamples import (
+    MODEL_SETTINGS,
     NOT_DECIDING,
-    OF_MODEL,
-    OF_SUITE,
+    SUITE_SETTINGS,
     Counterexample,
-    counterexamples,
+    counterexample_directory,
     decide_trials,
-    folder_of,
-    outcome_of,
+    evaluate_trial,
+    read_counterexamples,
 )
 from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.result import ClaimResult, SuiteResult
-from advsearch.questions.test.settings import NoWorseClaim, SuiteConfig, suite_of
+from advsearch.questions.test.settings import NoWorseClaim, SuiteConfig, parse_suite
 from advsearch.registry import get_experiment
 from advsearch.runs.listing import listed_run
 from advsearch.runs.store import Store
@@ -62,7 +62,7 @@ from advsearch.scene.color import linear_to_srgb
 from advsearch.settings import Setting, settings
 from advsearch.tasks import Judgement, Prediction
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
-from advsearch.viewer.server import following_page
+from advsearch.viewer.server import make_progress_page
 
 carry_out = get_experiment("test").run
 EASY, HARD = "small_models:easy", "small_models:hard"
@@ -143,7 +143,7 @@ def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tu
 
 
 def test_the_evidence_has_a_paragraph_for_each_claim(tested: tuple[SuiteResult, Path]) -> None:
-    kinds = [(one.kind, one.statement.partition(":")[0]) for one in claims_of(tested[0])]
+    kinds = [(one.kind, one.statement.partition(":")[0]) for one in collect_claims(tested[0])]
     measured = [("measured", name) for name in ("in-front", "behind")]
     assert sorted(kinds) == sorted([*measured, ("nothing claimed", "too-few"), ("measured", "no-worse")])
 
@@ -220,33 +220,33 @@ def test_a_model_that_looks_says_something_else_where_there_is_nothing_and_the_s
     failed = next(one for one in blind.claims if one.name == "black-must-change")
     assert "says something else when the picture is black" in failed.statement
     assert "before and" in failed.reason and (tmp_path / "blind" / str(failed.picture)).is_file()
-    assert words.MEANINGS["must_change"] in words.sarif(blind)
+    assert words.KIND_DESCRIPTIONS["must_change"] in words.format_sarif(blind)
 
 
-@pytest.mark.parametrize("name", CHANGED)
+@pytest.mark.parametrize("name", IMAGE_CHANGES)
 def test_what_changes_a_picture(name: str) -> None:
     picture = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(1))
-    changed = CHANGED[name](picture)
+    changed = IMAGE_CHANGES[name](picture)
     assert changed.shape == picture.shape and 0.0 <= float(changed.min()) and float(changed.max()) <= 1.0
     if name == "black":
         assert not changed.any()
     elif name == "covered":
         assert torch.allclose(changed, picture.mean(dim=(0, 1)).expand(8, 8, 3))
     elif name == "exposure":  # a middle grey of linear 0.2 is one of 0.252
-        assert torch.allclose(CHANGED[name](linear_to_srgb(torch.full((1, 1, 3), 0.2))), linear_to_srgb(
+        assert torch.allclose(IMAGE_CHANGES[name](linear_to_srgb(torch.full((1, 1, 3), 0.2))), linear_to_srgb(
             torch.full((1, 1, 3), 0.2 * 2 ** (1 / 3))), atol=1e-5)  # fmt: skip
     elif name == "shift":
         assert torch.equal(changed[:, 1:], picture[:, :-1])
     else:
         ramp = torch.linspace(0.2, 0.8, 64)[:, None, None].expand(64, 64, 3)
-        assert 0.0 < float((CHANGED[name](ramp) - ramp).abs().max()) < 0.03
+        assert 0.0 < float((IMAGE_CHANGES[name](ramp) - ramp).abs().max()) < 0.03
 
 
 @contextmanager
 def worked(config: AttackConfig, function: str, *more: Any) -> Iterator[InProcess | None]:
     """In place of workers: what they would do, in this process."""
     module, _, name = function.partition(":")
-    settings = config.to_repeat().plain()
+    settings = config.make_repeatable().to_json()
     yield None if config.workers is None else InProcess(getattr(import_module(module), name)(settings))
 
 
@@ -255,7 +255,7 @@ def worked(config: AttackConfig, function: str, *more: Any) -> Iterator[InProces
 def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictures(
     workers: int | None, tested: tuple[SuiteResult, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(workbench, "executor_for", worked)
+    monkeypatch.setattr(workbench, "open_executor", worked)
     chosen, suite = ("in-front", "no-worse", "too-few"), written(tmp_path, CLAIMS)
     config = SuiteConfig(suite=suite, only=",".join(chosen), workers=workers, run=str(tmp_path / "run"))
     whole = {one.name: (one.answer, one.reason, one.interval) for one in tested[0].claims if one.name in chosen}
@@ -325,7 +325,7 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
     suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
     added = carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "added")))
     assert added.status == 0 and added.added == str(tmp_path / "suite.counterexamples" / "found.json")
-    assert sum(path.stat().st_size for path in folder_of(suite).iterdir()) < 12_000
+    assert sum(path.stat().st_size for path in counterexample_directory(suite).iterdir()) < 12_000
     tried = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "tried")))
     assert [(one.name, one.answer, one.pictures) for one in tried.claims] == [
         ("found", "failed", 6),
@@ -339,7 +339,7 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
     assert every.changes == ["found: held -> failed", "too-few: held -> undecided"] and every.status == 0
     known = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "known")))
     assert known.status == 0 and [one.expected for one in known.claims] == ["failed", "undecided"]
-    skipped = ElementTree.fromstring(words.junit(known).partition("\n")[2])
+    skipped = ElementTree.fromstring(words.format_junit(known).partition("\n")[2])
     assert (skipped.get("failures"), skipped.get("errors"), skipped.get("skipped")) == ("0", "0", "2")
 
 
@@ -352,13 +352,13 @@ def test_an_adversarial_scene_that_does_not_hold_for_the_suite_s_model_is_not_ke
     Path(suite).write_text(yaml.safe_dump({"settings": always, "claims": {"too-few": CLAIMS["too-few"]}}))
     with pytest.raises(AdvsearchError, match=r"is not kept: right in 6 of 6 trials \(interval 54-100 %\)"):
         carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "run")))
-    assert counterexamples(suite) == [] and not list(folder_of(suite).glob("*.jpg"))
+    assert read_counterexamples(suite) == [] and not list(counterexample_directory(suite).glob("*.jpg"))
 
 
 def test_a_counterexample_of_another_scene_or_a_damaged_one_is_said(attacked: Path, tmp_path: Path) -> None:
     suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
     carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "added")))
-    file = folder_of(suite) / "found.json"
+    file = counterexample_directory(suite) / "found.json"
     kept = json.loads(file.read_text())
     file.write_text(json.dumps({**kept, "settings": {**kept["settings"], "environment": "loft"}}))
     other = carry_out(SuiteConfig(suite=suite, only="counterexamples", run=str(tmp_path / "other")))
@@ -367,7 +367,7 @@ def test_a_counterexample_of_another_scene_or_a_damaged_one_is_said(attacked: Pa
     for change, message in (({"offsets": "%%"}, "expected a counterexample"), ({"numbers": 3}, "expected 3 numbers")):
         file.write_text(json.dumps({**kept, "blocks": [{**block, **change}]}))
         with pytest.raises(AdvsearchError, match=message):
-            counterexamples(suite)
+            read_counterexamples(suite)
 
 
 SETTINGS: dict[str, Any] = {
@@ -397,10 +397,10 @@ def test_every_setting_that_decides_a_verdict_is_the_counterexample_s_own(settin
     """A new setting travels with a counterexample until somebody lists it as one that decides nothing."""
     assert {one.name for one in settings(AttackConfig)} == {*SETTINGS}
     wanted = {name: SETTINGS[name] for name in ("object", "controls", "over", "run", setting.name)}
-    suite = suite_of({"settings": {}, "claims": {"a": GOOD}, "seed": 5}, "suite.yaml")
-    judged = kept_case(**wanted).config_for(suite, {})
+    suite = parse_suite({"settings": {}, "claims": {"a": GOOD}, "seed": 5}, "suite.yaml")
+    judged = kept_case(**wanted).make_config(suite, {})
     same = getattr(judged, setting.field) == getattr(AttackConfig(**wanted), setting.field)
-    assert same or setting.name in OF_SUITE
+    assert same or setting.name in SUITE_SETTINGS
     of_others: dict[str, Any] = {
         "object": "bowl",
         "model": "other.pt2",
@@ -409,9 +409,9 @@ def test_every_setting_that_decides_a_verdict_is_the_counterexample_s_own(settin
         "task": "classification",
     }
     of_others |= {"environment": "noon", "resolution": 64, "camera": "robot", "exposure": 1.0, "set": {}}
-    other = suite_of({"settings": of_others, "claims": {"a": GOOD}}, "suite.yaml")
-    judged = kept_case(**wanted).config_for(other, {"model": None, "threads": 1, "deterministic": None})
-    if setting.name in (*OF_MODEL, *OF_SUITE):
+    other = parse_suite({"settings": of_others, "claims": {"a": GOOD}}, "suite.yaml")
+    judged = kept_case(**wanted).make_config(other, {"model": None, "threads": 1, "deterministic": None})
+    if setting.name in (*MODEL_SETTINGS, *SUITE_SETTINGS):
         assert (judged.model, judged.labels, judged.prompt, judged.threads) == ("other.pt2", None, None, 1)
     else:
         assert getattr(judged, setting.field) == getattr(AttackConfig(**wanted), setting.field)
@@ -421,9 +421,9 @@ def test_every_setting_that_decides_a_verdict_is_the_counterexample_s_own(settin
 
 
 def test_a_suite_s_labels_go_with_its_model_alone() -> None:
-    suite = suite_of({"settings": {"labels": "voc"}, "claims": {"a": GOOD}}, "suite.yaml")
-    assert kept_case(model="net.pt2", labels="coco").config_for(suite, {}).labels == "coco"
-    tested = kept_case(model="net.pt2", labels="coco").config_for(suite, {"model": "new.pt2"})
+    suite = parse_suite({"settings": {"labels": "voc"}, "claims": {"a": GOOD}}, "suite.yaml")
+    assert kept_case(model="net.pt2", labels="coco").make_config(suite, {}).labels == "coco"
+    tested = kept_case(model="net.pt2", labels="coco").make_config(suite, {"model": "new.pt2"})
     assert (tested.model, tested.labels) == ("new.pt2", "voc")
 
 
@@ -435,16 +435,16 @@ def test_a_counterexample_is_judged_by_its_own_label_and_says_where_a_model_has_
     values["settings"]["label"] = "vase"  # of the claims: by it what the model says of the case would be right
     Path(suite).write_text(yaml.safe_dump(values))
     carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "added")))
-    kept = json.loads((folder_of(suite) / "found.json").read_text())
+    kept = json.loads((counterexample_directory(suite) / "found.json").read_text())
     assert kept["settings"]["label"] is None and kept["settings"]["denoise"] == "none" and "policy" not in kept
     result = carry_out(SuiteConfig(suite=suite, only="counterexamples", run=str(tmp_path / "tried")))
     assert [one.answer for one in result.claims] == ["failed"]
-    recorded = recorded_settings(tmp_path / "tried", result, [])
+    recorded = collect_settings(tmp_path / "tried", result, [])
     assert [one.source for one in recorded] == ["", "counterexample found"], "and no claim that was not tried"
     assert recorded[1].values["denoise"] == "none" and recorded[1].as_text()["counterexample found: object"] == "mug"
-    assert "bundled model reference" not in made_with(tmp_path / "tried", [])
+    assert "bundled model reference" not in collect_versions(tmp_path / "tried", [])
     kept["settings"]["label"] = "zebra"
-    (folder_of(suite) / "found.json").write_text(json.dumps(kept))
+    (counterexample_directory(suite) / "found.json").write_text(json.dumps(kept))
     unknown = carry_out(SuiteConfig(suite=suite, only="counterexamples", run=str(tmp_path / "unknown")))
     assert unknown.claims[0].answer == "undecided" and unknown.status == 2
     reason = unknown.claims[0].reason
@@ -493,24 +493,28 @@ def test_conditions_in_which_the_clean_scene_is_wrong_do_not_count() -> None:
         Judgement(0.0, margin, right=margin > 0.0, prediction=Prediction(label))
         for margin, label in ((1.0, "mug"), (-1.0, "vase"), (-1.0, OUT_OF_VIEW))
     )
-    assert [outcome_of(wrong), outcome_of(right), outcome_of(hidden)] == [False, True, None]
-    assert [outcome_of(wrong, right), outcome_of(wrong, wrong), outcome_of(right, hidden)] == [False, None, None]
+    assert [evaluate_trial(wrong), evaluate_trial(right), evaluate_trial(hidden)] == [False, True, None]
+    assert [evaluate_trial(wrong, right), evaluate_trial(wrong, wrong), evaluate_trial(right, hidden)] == [
+        False,
+        None,
+        None,
+    ]
 
 
 def test_numbers_are_kept_finely_where_they_are_few_and_by_their_signs_on_squares_where_they_are_many() -> None:
     generator = np.random.default_rng(0)
     few = generator.uniform(-0.3, 0.3, 7).astype(np.float32)
-    assert np.abs(Block.of(few, True, 4).moved() - few).max() < 1e-4
+    assert np.abs(Block.quantize(few, True, 4).dequantize() - few).max() < 1e-4
     signs = np.sign(generator.normal(size=(20, 20, 3))).repeat(2, axis=0).repeat(2, axis=1).astype(np.float32)
     many = 0.05 * signs.ravel()
     sizes = []
     for squares, on, exact in ((True, 4, False), (True, 2, True), (True, 1, True), (False, 1, False)):
-        kept = Block.of(many, squares, on)
-        assert kept.moved().shape == many.shape and np.abs(kept.moved()).max() <= 0.0511
-        assert (np.abs(kept.moved() - many).max() < 1e-6) == exact
+        kept = Block.quantize(many, squares, on)
+        assert kept.dequantize().shape == many.shape and np.abs(kept.dequantize()).max() <= 0.0511
+        assert (np.abs(kept.dequantize() - many).max() < 1e-6) == exact
         sizes.append(len(kept.offsets))
     assert sizes[0] < sizes[1] < sizes[2]
-    assert Block.of(many[:-3], True, 4).square == 1, "no square texture"
+    assert Block.quantize(many[:-3], True, 4).square == 1, "no square texture"
 
 
 OBJECTS: dict[str, dict[str, Any]] = {
@@ -565,8 +569,8 @@ def check_sarif(value: Any, name: str = "log") -> None:
 def test_sarif_obeys_the_standard_whatever_a_suite_is_called(tested: tuple[SuiteResult, Path]) -> None:
     result, _ = tested
     for suite in (result.suite, "my suites/größe #1.yaml"):
-        check_sarif(json.loads(words.sarif(result.model_copy(update={"suite": suite}))))
-    log = json.loads(words.sarif(result))
+        check_sarif(json.loads(words.format_sarif(result.model_copy(update={"suite": suite}))))
+    log = json.loads(words.format_sarif(result))
     for broken in (
         {**log, "version": "2.0.0"},
         {**log, "runs": [{**log["runs"][0], "tool": {}}]},
@@ -616,10 +620,10 @@ def test_texts_of_others_stay_texts(tested: tuple[SuiteResult, Path]) -> None:
     result, _ = tested
     odd = ClaimResult(name="odd", kind="right", statement="<b>|`\x00", answer="failed", reason="a | b\n<script>")
     odd_result = result.model_copy(update={"claims": [odd], "title": "T\x07 & <x>"})
-    root = ElementTree.fromstring(words.junit(odd_result).partition("\n")[2])
+    root = ElementTree.fromstring(words.format_junit(odd_result).partition("\n")[2])
     assert root.find("testsuite") is not None and root[0].get("name") == "T? & <x>"
-    assert "| odd | failed |  | a \\| b \\<script\\> |" in words.markdown(odd_result)
-    assert json.loads(words.sarif(odd_result))["runs"][0]["results"][0]["ruleId"] == "right"
+    assert "| odd | failed |  | a \\| b \\<script\\> |" in words.format_markdown(odd_result)
+    assert json.loads(words.format_sarif(odd_result))["runs"][0]["results"][0]["ruleId"] == "right"
 
 
 # ---- bad suites -----------------------------------------------------------------------------------------------------
@@ -804,7 +808,7 @@ def test_a_suite_at_work_is_running(tmp_path: Path, capsys: pytest.CaptureFixtur
     class Watching(NullProgress):
         def message(self, text: str) -> None:
             if text.startswith("no-worse:"):  # the summary of the first claim is there, which a kill would leave
-                said.extend([listed_run(tmp_path / "run").state, following_page("run", tmp_path / "run")])
+                said.extend([listed_run(tmp_path / "run").state, make_progress_page("run", tmp_path / "run")])
                 assert main(["show", str(tmp_path / "run")]) == 0
                 said.append(capsys.readouterr().out)
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from advsearch import threads
-from advsearch.scene.mitsuba_backend.denoise import KEY, _buffers, _gain, denoise
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.denoise import KEY_LUMINANCE, _compute_gain, _get_buffers, denoise
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 
 SIZE = (72, 88)
 
@@ -35,7 +35,7 @@ def on(count: int) -> Iterator[None]:
 
 @pytest.mark.medium
 def test_the_same_bytes_at_any_number_of_threads() -> None:
-    mitsuba()
+    import_mitsuba()
     flat = torch.full((*SIZE, 3), 0.5)
     pictures = [noisy(seed) for seed in range(4)]
     found = []
@@ -46,18 +46,18 @@ def test_the_same_bytes_at_any_number_of_threads() -> None:
 
 
 def test_the_brightness_is_what_the_denoiser_finds_itself() -> None:
-    mitsuba()
+    import_mitsuba()
     import mitsuba_oidn
 
     picture, flat = noisy(5), torch.full((*SIZE, 3), 0.5)
     own = mitsuba_oidn.denoise(picture, flat, flat, hdr=True)
     assert torch.allclose(denoise(picture, flat, flat), own, rtol=1e-4, atol=1e-5)
-    apart = mitsuba_oidn.denoise(picture, flat, flat, hdr=True, input_scale=1.1 * _gain(picture))
+    apart = mitsuba_oidn.denoise(picture, flat, flat, hdr=True, input_scale=1.1 * _compute_gain(picture))
     assert not torch.allclose(apart, own, rtol=1e-4, atol=1e-5), "else the brightness decides nothing here"
 
 
 def test_the_quick_one_is_another_and_takes_the_noise_out_too() -> None:
-    mitsuba()
+    import_mitsuba()
     picture, flat = noisy(5), torch.full((*SIZE, 3), 0.5)
     full, quick = (denoise(picture, flat, flat, quick=one) for one in (False, True))
     assert not torch.equal(full, quick)
@@ -65,19 +65,19 @@ def test_the_quick_one_is_another_and_takes_the_noise_out_too() -> None:
 
 
 def test_pictures_of_a_size_are_denoised_in_the_same_memory_and_spoil_nothing() -> None:
-    mitsuba()
+    import_mitsuba()
     flat = torch.full((*SIZE, 3), 0.5)
     first = denoise(noisy(1), flat, flat)
     kept, second = first.clone(), denoise(noisy(2), flat, flat)
     assert torch.equal(first, kept) and not torch.equal(first, second)
-    own, other = _buffers(SIZE, 1), _buffers(SIZE, 2)
-    assert own is _buffers(SIZE, 1) and own[0].data_ptr() != other[0].data_ptr()
+    own, other = _get_buffers(SIZE, 1), _get_buffers(SIZE, 2)
+    assert own is _get_buffers(SIZE, 1) and own[0].data_ptr() != other[0].data_ptr()
 
 
 def test_black_squares_do_not_count() -> None:
     picture = torch.zeros(32, 48, 3)
-    assert _gain(picture) == 1.0
+    assert _compute_gain(picture) == 1.0
     picture[:16, 16:32] = 2.0
-    assert _gain(picture) == pytest.approx(KEY / 2.0)
+    assert _compute_gain(picture) == pytest.approx(KEY_LUMINANCE / 2.0)
     picture[16:, :16] = 8.0
-    assert _gain(picture) == pytest.approx(KEY / 4.0)
+    assert _compute_gain(picture) == pytest.approx(KEY_LUMINANCE / 4.0)

@@ -19,13 +19,13 @@ UBUNTU = {"ID": "ubuntu", "ID_LIKE": "debian", "VERSION_ID": "24.04"}
 UBUNTU_22 = {**UBUNTU, "VERSION_ID": "22.04"}
 FEDORA = {"ID": "fedora", "VERSION_ID": "42"}
 
-linux_only = pytest.mark.skipif(not llvm.own_elf_header(), reason="libraries are not ELF files here")
+linux_only = pytest.mark.skipif(not llvm.read_interpreter_header(), reason="libraries are not ELF files here")
 
 
 @pytest.fixture(autouse=True)
 def _fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Each test starts without the variable and a remembered choice, and leaves none to the tests after it."""
-    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    monkeypatch.delenv(llvm.ENVIRONMENT_VARIABLE, raising=False)
     monkeypatch.delenv("CONDA_PREFIX", raising=False)
     llvm.ensure_llvm.cache_clear()
     yield
@@ -36,7 +36,7 @@ def library(root: Path, path: str, content: bytes | None = None) -> Path:
     """Make a file that looks like a library for this interpreter."""
     file = root / path
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(llvm.own_elf_header() if content is None else content)
+    file.write_bytes(llvm.read_interpreter_header() if content is None else content)
     return file
 
 
@@ -56,37 +56,37 @@ def library(root: Path, path: str, content: bytes | None = None) -> Path:
 )
 def test_finds_each_platforms_file_and_its_version(tmp_path: Path, path: str, version: tuple[int, ...]) -> None:
     library(tmp_path, path)
-    (found,) = llvm.find(tmp_path, {})
-    assert (found.version, found.refused) == (version, "")
+    (found,) = llvm.find_libraries(tmp_path, {})
+    assert (found.version, found.refusal) == (version, "")
 
 
 def test_version_of_a_homebrew_link_is_read_from_where_it_leads(tmp_path: Path) -> None:
     library(tmp_path, "opt/homebrew/Cellar/llvm/19.1.7/lib/libLLVM.dylib")
     (tmp_path / "opt/homebrew/opt").mkdir()
     (tmp_path / "opt/homebrew/opt/llvm").symlink_to(tmp_path / "opt/homebrew/Cellar/llvm/19.1.7")
-    assert [c.version for c in llvm.find(tmp_path, {})] == [(19, 1, 7)]
+    assert [c.version for c in llvm.find_libraries(tmp_path, {})] == [(19, 1, 7)]
 
 
 def test_finds_an_active_conda_environments_file(tmp_path: Path) -> None:
     library(tmp_path, "home/me/conda/envs/a/lib/libLLVM-19.so")
-    assert [c.version for c in llvm.find(tmp_path, {"CONDA_PREFIX": "/home/me/conda/envs/a"})] == [(19,)]
-    assert llvm.find(tmp_path, {}) == []
+    assert [c.version for c in llvm.find_libraries(tmp_path, {"CONDA_PREFIX": "/home/me/conda/envs/a"})] == [(19,)]
+    assert llvm.find_libraries(tmp_path, {}) == []
 
 
 def test_newest_usable_comes_first_and_old_ones_are_refused_with_the_reason(tmp_path: Path) -> None:
     for name in ("libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1", "libLLVM.so.19.1", "libLLVM.so.20.1"):
         library(tmp_path, f"usr/lib/x86_64-linux-gnu/{name}")
-    found = llvm.find(tmp_path, {})
+    found = llvm.find_libraries(tmp_path, {})
     assert [c.version[0] for c in found] == [20, 19, 16, 15, 14]
-    assert [bool(c.refused) for c in found] == [False, False, True, True, True]
-    assert "aborts the process" in found[2].refused
-    assert "Dr.Jit refuses" in found[4].refused
+    assert [bool(c.refusal) for c in found] == [False, False, True, True, True]
+    assert "aborts the process" in found[2].refusal
+    assert "Dr.Jit refuses" in found[4].refusal
 
 
 def test_other_libraries_of_llvm_are_not_taken_for_it(tmp_path: Path) -> None:
     for name in ("libLLVMCore.so.19", "libLLVM-19.so.1.bak.txt", "libLLVMSupport.a", "libLLVM.a"):
         library(tmp_path, f"usr/lib/{name}")
-    assert [c.path.name for c in llvm.find(tmp_path, {})] in ([], ["libLLVM-19.so.1.bak.txt"])
+    assert [c.path.name for c in llvm.find_libraries(tmp_path, {})] in ([], ["libLLVM-19.so.1.bak.txt"])
 
 
 @linux_only
@@ -95,13 +95,13 @@ def test_other_libraries_of_llvm_are_not_taken_for_it(tmp_path: Path) -> None:
     [
         (b"", "not a shared library"),
         (b"INPUT(libLLVM-19.so)\n", "not a shared library"),
-        (llvm.own_elf_header()[:18] + b"\x28\x00", "another processor"),
+        (llvm.read_interpreter_header()[:18] + b"\x28\x00", "another processor"),
     ],
 )
 def test_a_file_that_is_no_library_for_this_machine_is_refused(tmp_path: Path, content: bytes, reason: str) -> None:
     library(tmp_path, "usr/lib/libLLVM.so.19.1", content)
-    (found,) = llvm.find(tmp_path, {})
-    assert reason in found.refused
+    (found,) = llvm.find_libraries(tmp_path, {})
+    assert reason in found.refusal
 
 
 @linux_only
@@ -109,7 +109,7 @@ def test_a_usable_name_on_a_broken_file_is_passed_over(tmp_path: Path) -> None:
     """The header is right and the rest is missing: the loader says so, and the next candidate is taken."""
     library(tmp_path, "usr/lib/libLLVM.so.99.1")
     with pytest.raises(EnvironmentSetupError, match=r"libLLVM\.so\.99\.1 \(cannot be loaded: .*Install one with"):
-        llvm.newest(llvm.find(tmp_path, {}))
+        llvm.select_newest(llvm.find_libraries(tmp_path, {}))
 
 
 def test_message_without_any_usable_file_lists_what_is_there_and_what_to_type(
@@ -120,11 +120,11 @@ def test_message_without_any_usable_file_lists_what_is_there_and_what_to_type(
     monkeypatch.setattr(os, "geteuid", lambda: 1000, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     with pytest.raises(EnvironmentSetupError) as caught:
-        llvm.newest(llvm.find(tmp_path, {}))
+        llvm.select_newest(llvm.find_libraries(tmp_path, {}))
     message = str(caught.value)
     assert f"{old} (15: it aborts the process" in message
     assert "sudo apt-get install libllvm19" in message
-    assert llvm.VARIABLE in message
+    assert llvm.ENVIRONMENT_VARIABLE in message
 
 
 @pytest.mark.parametrize(
@@ -138,12 +138,12 @@ def test_message_without_any_usable_file_lists_what_is_there_and_what_to_type(
     ],
 )
 def test_install_command_of_each_platform_is_one_line(release: dict[str, str], system: str, command: str) -> None:
-    answer = llvm.install_command(release, system)
+    answer = llvm.get_install_command(release, system)
     assert command in answer and "\n" not in answer
 
 
 def test_install_command_of_an_unknown_platform_lists_all() -> None:
-    answer = llvm.install_command({"ID": "nixos"}, "linux")
+    answer = llvm.get_install_command({"ID": "nixos"}, "linux")
     assert [line.split(":")[0].strip() for line in answer.splitlines()] == [
         "Debian, Ubuntu",
         "Fedora",
@@ -154,14 +154,14 @@ def test_install_command_of_an_unknown_platform_lists_all() -> None:
 
 def test_install_command_in_a_conda_environment_is_condas(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CONDA_PREFIX", "/somewhere")
-    assert llvm.install_command(DEBIAN, "linux").startswith("conda install")
+    assert llvm.get_install_command(DEBIAN, "linux").startswith("conda install")
 
 
 def test_variable_wins_over_what_would_be_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = library(tmp_path, "mine/libLLVM.so.18.1")
-    monkeypatch.setenv(llvm.VARIABLE, str(given))
+    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, str(given))
     assert llvm.ensure_llvm() == llvm.LibraryFile(given, (18, 1))
-    assert os.environ[llvm.VARIABLE] == str(given)
+    assert os.environ[llvm.ENVIRONMENT_VARIABLE] == str(given)
 
 
 @pytest.mark.parametrize(
@@ -170,13 +170,15 @@ def test_variable_wins_over_what_would_be_found(tmp_path: Path, monkeypatch: pyt
 def test_variable_that_names_an_old_file_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str
 ) -> None:
-    monkeypatch.setenv(llvm.VARIABLE, str(library(tmp_path, name)))
-    with pytest.raises(EnvironmentSetupError, match=rf"{llvm.VARIABLE}: expected .* version 17 or later.*{text}"):
+    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, str(library(tmp_path, name)))
+    with pytest.raises(
+        EnvironmentSetupError, match=rf"{llvm.ENVIRONMENT_VARIABLE}: expected .* version 17 or later.*{text}"
+    ):
         llvm.ensure_llvm()
 
 
 def test_variable_that_names_no_file_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so.19.1")
+    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, "/nowhere/libLLVM.so.19.1")
     with pytest.raises(EnvironmentSetupError, match=r"'/nowhere/libLLVM\.so\.19\.1', which does not exist"):
         llvm.ensure_llvm()
 
@@ -184,21 +186,21 @@ def test_variable_that_names_no_file_is_an_error(monkeypatch: pytest.MonkeyPatch
 def test_a_file_without_a_version_in_its_name_is_asked_for_it(tmp_path: Path) -> None:
     """This file cannot be loaded, so it cannot answer, and is refused for that."""
     library(tmp_path, "usr/lib/libLLVM.so")
-    (found,) = llvm.find(tmp_path, {})
-    assert "does not tell its version" in found.refused
+    (found,) = llvm.find_libraries(tmp_path, {})
+    assert "does not tell its version" in found.refusal
 
 
 def test_this_machine_has_a_usable_one_and_it_tells_the_version_of_its_name() -> None:
     chosen = llvm.ensure_llvm()
-    assert chosen.version[0] >= llvm.MINIMUM
-    assert llvm.asked_version(str(chosen.path))[: len(chosen.version)] == chosen.version
+    assert chosen.version[0] >= llvm.MIN_VERSION
+    assert llvm.query_version(str(chosen.path))[: len(chosen.version)] == chosen.version
 
 
 def test_command_prints_the_choice_or_fails_with_the_message(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "advsearch.scene.mitsuba_backend.llvm"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "libLLVM" in done.stdout or "LLVM-C" in done.stdout
-    environ = os.environ | {llvm.VARIABLE: str(tmp_path / "none.so")}
+    environ = os.environ | {llvm.ENVIRONMENT_VARIABLE: str(tmp_path / "none.so")}
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environ)
     assert (done.returncode, done.stdout) == (3, "")
     assert "does not exist" in done.stderr
@@ -206,13 +208,13 @@ def test_command_prints_the_choice_or_fails_with_the_message(tmp_path: Path) -> 
 
 def test_mitsuba_comes_with_our_variant_few_messages_and_all_threads() -> None:
     from advsearch import threads
-    from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba
+    from advsearch.scene.mitsuba_backend.variant import VARIANT, import_mitsuba
 
-    mi = mitsuba()
+    mi = import_mitsuba()
     import drjit as dr
 
     assert mi.variant() == VARIANT
     assert dr.log_level() == dr.LogLevel.Warn
     assert threads.configure(1) == dr.thread_count() == 1
     assert threads.configure() == dr.thread_count() >= 1
-    assert mitsuba() is mi
+    assert import_mitsuba() is mi

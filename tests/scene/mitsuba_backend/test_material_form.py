@@ -12,7 +12,7 @@ from torch import Tensor
 
 from advsearch.scene.library import load_environment, load_object
 from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS, material_adjoint
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 
 SIZE = 48
 SPP = 64
@@ -36,14 +36,14 @@ class Setup:
     depth: int = 2
 
     def write(self, vertices: Tensor, normals: Tensor) -> None:
-        mi = mitsuba()
+        mi = import_mitsuba()
         self.parameters["object.vertex_positions"] = mi.Float(vertices.float().contiguous().ravel())
         self.parameters["object.vertex_normals"] = mi.Float(normals.float().contiguous().ravel())
         self.parameters.update()
 
     def radiance(self, seed: int, spp: int) -> Tensor:
-        tracer = mitsuba().load_dict({"type": "path", "max_depth": self.depth})
-        image: Tensor = mitsuba().render(self.scene, integrator=tracer, seed=seed, spp=spp).torch().clone()
+        tracer = import_mitsuba().load_dict({"type": "path", "max_depth": self.depth})
+        image: Tensor = import_mitsuba().render(self.scene, integrator=tracer, seed=seed, spp=spp).torch().clone()
         return image
 
     def adjoint(self, cotangent: Tensor, seed: int = 0, **options: Any) -> tuple[Tensor, Tensor]:
@@ -73,7 +73,7 @@ def build(
     name: str, *, lift: float = 0.2, ground: bool = False, aside: float = 0.0, distance: float = 3.2, **surface: float
 ) -> Setup:
     """One object above z = 0 under an overcast sky."""
-    mi = mitsuba()
+    mi = import_mitsuba()
     place = mi.ScalarTransform4f
     asset = load_object(name)
     count = len(asset.mesh.vertices)

@@ -50,7 +50,7 @@ def test_media_are_known_as_long_as_their_scene_and_loose_ones_for_good() -> Non
     population, owner = Population(), Owner()
     population.add(owner, media=("smoke",))
     population.add(population, media=("haze",))
-    assert population.media() == ["smoke", "haze"]
+    assert population.list_media() == ["smoke", "haze"]
     del owner
-    population.bury()
-    assert population.media() == ["haze"]
+    population.free_unused()
+    assert population.list_media() == ["haze"]

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from advsearch.scene.mitsuba_backend.variant import mitsuba, recorded
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba, record_on_first_use
 
 COLLECTED_IN_A_RECORDING = """
 import gc, weakref
@@ -60,7 +60,7 @@ def test_a_scene_in_a_cycle_is_not_collected_while_another_is_recorded() -> None
 
 @pytest.mark.parametrize("on", [gc.enable, gc.disable])
 def test_the_collector_is_as_it_was_after_a_recording_and_an_error_in_one(on: Callable[[], None]) -> None:
-    mi = mitsuba()
+    mi = import_mitsuba()
     import drjit as dr
 
     wrong, states = [True], list[bool]()
@@ -71,7 +71,7 @@ def test_the_collector_is_as_it_was_after_a_recording_and_an_error_in_one(on: Ca
             raise KeyboardInterrupt
         return value / 2
 
-    function = recorded(halves, [])
+    function = record_on_first_use(halves, [])
     before = gc.isenabled()
     try:
         on()

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.scene.library import load_object
-from advsearch.scene.mitsuba_backend.texel_rays import measured
+from advsearch.scene.mitsuba_backend.texel_rays import measure_lobes
 from advsearch.scene.predictor import RefusalCause
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import arrangement, renderer, texels
-from advsearch.scene.surface.renderer import SurfaceRenderer, why_not
-from advsearch.scene.surface.texels import sky_of
+from advsearch.scene.surface.renderer import SurfaceRenderer, find_refusal
+from advsearch.scene.surface.texels import prepare_sky
 
 SIDE = 32
 VARYING = ["camera", "environment"]
@@ -27,7 +27,7 @@ VARYING = ["camera", "environment"]
 def coarse() -> Iterator[None]:
     """Few texels and rays, which are quick."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(texels, "GROUND", 32)
+        patched.setattr(texels, "GROUND_TEXELS", 32)
         for name, value in {"SIDE": 48, "GATHERED": 100}.items():
             patched.setattr(arrangement, name, value)
         yield
@@ -95,7 +95,7 @@ def test_pictures_through_a_lens_are_those_that_are_traced(camera: str | None, f
     """Ray by ray, so that they are far from what a pinhole sees, and black where the lens sees nothing."""
     scene = load_scene("mug", camera=camera)
     traced = scene.renderer({"texture": {"resolution": 16}, "camera": {"azimuth": [0, 360], **fixed}}, resolution=SIDE)
-    assert why_not(traced, ["camera"]) is None
+    assert find_refusal(traced, ["camera"]) is None
     light = SurfaceRenderer(traced, traced.start, seed=0)
     u = drawn(traced, 1)
     with torch.no_grad():
@@ -106,7 +106,7 @@ def test_pictures_through_a_lens_are_those_that_are_traced(camera: str | None, f
 
 def test_pictures_of_several_cameras_at_once_are_those_of_each(light: SurfaceRenderer) -> None:
     """Two of them under one light, one under another."""
-    renderer = light.traced
+    renderer = light.path_renderer
     first, second = drawn(renderer, 0), drawn(renderer, 1)
     third = second.clone()
     for group in renderer.space.groups:
@@ -114,8 +114,8 @@ def test_pictures_of_several_cameras_at_once_are_those_of_each(light: SurfaceRen
             third[group.coordinates] = first[group.coordinates]
     wholes = [first, second, third]
     with torch.no_grad():
-        inputs = [light.inputs(one) for one in wholes]
-        together = light.shown(light.looks(inputs), inputs, light.color(inputs[0]), wholes)
+        inputs = [light.compute_inputs(one) for one in wholes]
+        together = light.compose_images(light.trace_views(inputs), inputs, light.get_color(inputs[0]), wholes)
         assert torch.equal(together, torch.stack([light(one) for one in wholes]))
 
 
@@ -123,14 +123,14 @@ def test_pictures_stay_when_the_scene_had_a_map_of_another_size(traced: Renderer
     """What is recorded goes on with the size of the picture."""
     with torch.no_grad():
         before = light(traced.start)
-        traced.scene.held({"environment.padded": torch.rand(31, 64, 3)})
+        traced.scene.set_inputs({"environment.padded": torch.rand(31, 64, 3)})
         assert torch.equal(light(traced.start), before)
 
 
 @pytest.mark.medium
 def test_the_derivative_is_that_of_differences(traced: Renderer) -> None:
     """Of radiance in the texture, in which it is linear but for the curve between both."""
-    linear = SurfaceRenderer(traced.like(transfer="linear"), traced.start, seed=0)
+    linear = SurfaceRenderer(traced.copy_with(transfer="linear"), traced.start, seed=0)
     u = set_to(traced, 0.5).requires_grad_()
     generator = torch.Generator().manual_seed(3)
     weights = torch.rand(SIDE, SIDE, 3, generator=generator) - 0.5
@@ -152,8 +152,8 @@ def test_rays_go_where_those_of_the_camera_do(size: tuple[int, int]) -> None:
     of = scene.renderer({"camera": camera}, resolution=size)
     made = SurfaceRenderer(of, of.start, seed=0)
     inputs = of.scene.assembly(of.space.inputs(of.start))
-    cameras = [{name: inputs.get(name, of.scene.base(name)) for name in arrangement.CAMERAS}]
-    covered = made.arrangement.look(cameras, made.light(inputs))().covered[0, ..., 0]
+    cameras = [{name: inputs.get(name, of.scene.get_base_value(name)) for name in arrangement.CAMERA_INPUTS}]
+    covered = made.arrangement.start_tracing(cameras, made.compute_light(inputs))().coverage[0, ..., 0]
     same = (covered > 0.5) == (of.surfaces(of.start).id > 0)
     assert 0.1 < float((covered > 0.5).float().mean()) < 0.9
     assert float(same.float().mean()) > 0.97
@@ -201,11 +201,11 @@ def test_an_object_out_of_sight_has_no_derivative() -> None:
     of = renderer_of(load_scene("ball"))
     made = SurfaceRenderer(of, of.start, seed=0)
     inputs = of.scene.assembly(of.space.inputs(of.start))
-    matrix = inputs.get("camera.to_world", of.scene.base("camera.to_world")).clone()
+    matrix = inputs.get("camera.to_world", of.scene.get_base_value("camera.to_world")).clone()
     matrix[:3, 0], matrix[:3, 2] = -matrix[:3, 0], -matrix[:3, 2]
     color = torch.full((16, 16, 3), 0.5, requires_grad=True)
     turned = [{**inputs, "camera.to_world": matrix}]
-    picture = made.shown(made.looks(turned), turned, color, [of.start])
+    picture = made.compose_images(made.trace_views(turned), turned, color, [of.start])
     (found,) = torch.autograd.grad(picture.sum(), color)
     assert not bool(found.any()) and float(picture.detach().mean()) > 0.0
 
@@ -216,10 +216,10 @@ def test_lights_make_room(traced: Renderer, monkeypatch: pytest.MonkeyPatch) -> 
     made = SurfaceRenderer(traced, traced.start, seed=0)
     with torch.no_grad():
         before = made(drawn(traced, 0))
-        monkeypatch.setattr(renderer, "MOST_BYTES", made.bytes + 1000)
+        monkeypatch.setattr(renderer, "MAX_BYTES", made.n_bytes + 1000)
         made(drawn(traced, 1))
-        assert made.dropped == 1
-        assert torch.equal(made(drawn(traced, 0)), before) and made.dropped == 2
+        assert made.n_dropped == 1
+        assert torch.equal(made(drawn(traced, 0)), before) and made.n_dropped == 2
 
 
 @pytest.mark.medium
@@ -229,7 +229,7 @@ def test_light_between_surfaces_follows_the_texture_when_it_is_renewed(traced: R
     white = set_to(traced, 1.0)
     with torch.no_grad():
         before = made(white).mean()
-        made.renew(black)
+        made.update_base_color(black)
         after = made(white).mean()
     assert float(after) < float(before)
 
@@ -242,7 +242,7 @@ def test_a_surface_is_measured() -> None:
         scene = load_scene("ball", settings={"material.roughness": roughness, "material.metallic": metallic})
         of = scene.renderer("texture", resolution=8)
         made = SurfaceRenderer(of, of.start, seed=0).arrangement
-        lobes = measured(of.scene, {}, made.texels.grids[0], made.texels.places[9], made.texels.normals[9])
+        lobes = measure_lobes(of.scene, {}, made.texels.grids[0], made.texels.positions[9], made.texels.normals[9])
         shares[metallic] = lobes
     mug, mirror = shares[0.0], shares[1.0]
     assert mug.diffuse[-1] == pytest.approx(1.0, abs=0.05)
@@ -255,15 +255,15 @@ def test_a_surface_is_measured() -> None:
 def test_what_it_cannot_predict_has_a_reason() -> None:
     """In words, before anything is measured."""
     mug = load_scene("mug")
-    assert why_not(renderer_of(mug), VARYING) is None
-    still = why_not(mug.renderer({"environment": {"exposure": [0, 1]}}, resolution=8), ["environment"])
+    assert find_refusal(renderer_of(mug), VARYING) is None
+    still = find_refusal(mug.renderer({"environment": {"exposure": [0, 1]}}, resolution=8), ["environment"])
     assert still is not None and still.cause is RefusalCause.NO_CAMERA
-    assert "vertices" in str(why_not(mug.renderer({"pose": {"yaw": [0, 9]}}, resolution=8), ["pose"]))
+    assert "vertices" in str(find_refusal(mug.renderer({"pose": {"yaw": [0, 9]}}, resolution=8), ["pose"]))
     lit = mug.renderer({"texture": {"resolution": 2}, "light": {"power": [0, 9]}}, resolution=8)
-    assert "more in the scene" in str(why_not(lit, ["light"]))
-    assert "pose.yaw" in str(why_not(mug.renderer({"pose": {"yaw": [0, 9]}}, resolution=8), []))
+    assert "more in the scene" in str(find_refusal(lit, ["light"]))
+    assert "pose.yaw" in str(find_refusal(mug.renderer({"pose": {"yaw": [0, 9]}}, resolution=8), []))
     undenoised = mug.renderer({"camera": {"azimuth": [0, 9]}}, resolution=8, denoise="none")
-    assert "denoiser" in str(why_not(undenoised, ["camera"]))
+    assert "denoiser" in str(find_refusal(undenoised, ["camera"]))
 
 
 def cut(opacity: float) -> Renderer:
@@ -287,7 +287,7 @@ def test_light_passes_cut_outs(opacity: float, whole: SurfaceRenderer) -> None:
     """What is behind them is seen, with the light that comes in; without that a picture is much further off."""
     of = cut(opacity)
     made = SurfaceRenderer(of, of.start, seed=0)
-    assert why_not(of, VARYING) is None and made.arrangement.sides == 2 and whole.arrangement.sides == 1
+    assert find_refusal(of, VARYING) is None and made.arrangement.n_sides == 2 and whole.arrangement.n_sides == 1
     with torch.no_grad():
         for number in range(2):
             u = drawn(of, number)
@@ -299,7 +299,7 @@ def test_a_sun_of_one_texel_is_as_wide_as_the_map_shows_it() -> None:
     """Looked up between texels it is a tent, a texel to each side, whose variance is a sixth of a texel squared."""
     padded = torch.full((16, 34, 3), 0.3)
     padded[7, 12] = 1e5
-    ways, light = sky_of(padded).hot
+    ways, light = prepare_sky(padded).hot
     row, column = ways[:, 1].acos() * (15.0 / torch.pi), torch.atan2(ways[:, 0], -ways[:, 2]) * (16.0 / torch.pi)
     for found, middle in ((row, 7.0), (column, 11.5)):
         assert float(found.mean()) == pytest.approx(middle, abs=0.01)
@@ -321,7 +321,7 @@ def test_exposures_of_one_map_share_its_light(traced: Renderer, light: SurfaceRe
     assert not torch.equal(brighter, first) and not torch.equal(turned, first)
     with torch.no_grad():
         inputs = [traced.scene.assembly(traced.space.inputs(u)) for u in (first, brighter, turned)]
-        lights, factors = zip(*map(light.kept_light, inputs), strict=True)
+        lights, factors = zip(*map(light.get_light, inputs), strict=True)
         own = SurfaceRenderer(traced, traced.start, seed=0)(brighter)
         assert lights[1] is lights[0] and lights[2] is not lights[0]
         assert float((factors[1] - factors[0]).abs().min()) > 0.05

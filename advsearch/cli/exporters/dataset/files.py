@@ -48,13 +48,13 @@ class Categories:
         """
         own = image.task
         facts = image.facts
-        if isinstance(own, tasks.Together):
+        if isinstance(own, tasks.EnsembleTask):
             own = own.tasks[0]
         labels: tuple[str, ...] = (facts.label or facts.own_label or facts.object,)
         right = 0
         if isinstance(own, tasks.ClassTask) and own.labels:
             labels = own.labels
-            right = own.right_classes(facts)[0]
+            right = own.find_right_classes(facts)[0]
         if self.labels not in ((), labels):
             raise InputError(
                 f"RUN: its parts have other categories, {facts.object} among them; "
@@ -111,7 +111,7 @@ def write_dataset(
                     make_thing(len(things) + k, number, *one)
                     for k, one in enumerate(seen, 1)
                 ]
-                others += not shown.same
+                others += not shown.is_reproduced
                 # the class, the middle of the box and its size, as shares of the
                 # picture
                 if format == "yolo":
@@ -146,7 +146,7 @@ def write_dataset(
                 named = [
                     (number, name)
                     for number, name in enumerate(categories.labels)
-                    if not models.names_nothing(name)
+                    if not models.is_nothing_name(name)
                 ]
                 dataset: dict[str, Any] = {
                     "info": {

@@ -40,7 +40,7 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
     if os.path.lexists(out):
         raise InputError(f"out: {out} is there already; choose another name")
     adversarial = exports.AdversarialRun.load(run)
-    slices = adversarial.problem.space.slices(adversarial.u)
+    slices = adversarial.problem.space.split_by_control(adversarial.u)
     projectors: list[tuple[Any, Tensor]] = [
         (control, part) for control, part in slices if has_pattern(control)
     ]
@@ -61,7 +61,7 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
             small = torch.nn.functional.avg_pool2d(
                 marks.permute(2, 0, 1)[None], factor
             )[0].permute(1, 2, 0)
-            Exporter.write_png(folder / "picture.png", images.enlarged(pattern, factor))
+            Exporter.write_png(folder / "picture.png", images.enlarge(pattern, factor))
             Exporter.write_png(folder / "texels.png", pattern)
             Exporter.write_png(folder / "marks.png", color.linear_to_srgb(marks))
             lit = control.scene_inputs(

@@ -24,7 +24,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     what is no part of it. Raises errors as `AdversarialRun.load`, and InputError where
     such files are there, or stock Mitsuba has no such scene.
     """
-    path = out if out.suffix.lower() == XML else out / mitsuba_data.NAME
+    path = out if out.suffix.lower() == XML else out / mitsuba_data.SCENE_FILE_NAME
     taken = [path, *path.parent.glob(f"{path.stem}-*")] if path.parent.is_dir() else []
     there = [file for file in taken if os.path.lexists(file)]
     if there or path.parent.is_file() or os.path.islink(out):
@@ -37,7 +37,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     backdrop = on_picture.get("backdrop.color")
     hazes = (
         part.name
-        for part in renderer.scene.made[0].parts
+        for part in renderer.scene.definition[0].parts
         if isinstance(part, parts.HazePart)
     )
     hazy = any(float(inputs[f"{name}.density"]) > 0.0 for name in hazes)
@@ -67,13 +67,13 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     if hazy:
         notes.append(
             "Haze scatters light, which Mitsuba counts as a segment: "
-            f"{mitsuba_data.SCATTERINGS} more are for that."
+            f"{mitsuba_data.EXTRA_DEPTH} more are for that."
         )
     if renderer.formation.denoiser != "none":
         notes.append("Not in it: the denoiser. Take many samples a pixel.")
-    if adversarial.on_picture:
+    if adversarial.image_controls:
         notes.append(
-            f"Not in it: what the control {', '.join(adversarial.on_picture)} "
+            f"Not in it: what the control {', '.join(adversarial.image_controls)} "
             "did to the finished picture."
         )
     if adversarial.problem.conditions is not None:
@@ -86,7 +86,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
                 inputs,
                 Path(made) / path.name,
                 " ".join(notes),
-                hide=backdrop is not None,
+                hide_environment=backdrop is not None,
             )
             for one in sorted(Path(made).iterdir()):
                 os.replace(one, path.parent / one.name)
@@ -119,7 +119,7 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
             mesh=replace(found.mesh, vertices=found.mesh.vertices * np.float32(metres)),
         )
     with writing.placed_by("out"):
-        writing.write_bytes(out, reading.glb([found]))
+        writing.write_bytes(out, reading.encode_glb([found]))
     unit = "object sizes" if metres is None else "metres"
     notes = [f"Lengths are in {unit}, y is up, and the texture is rounded to 8 bits."]
     if part.surface is not None:
@@ -127,9 +127,9 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
             "Its surface is one of Mitsuba's own, of which glTF has the base "
             "colour only."
         )
-    elif found.material.specular > reading.PLAIN:
+    elif found.material.specular > reading.DEFAULT_SPECULAR:
         notes.append(
             f"A specular of {found.material.specular:g} is over glTF's largest, "
-            f"{reading.PLAIN:g}, which it has there."
+            f"{reading.DEFAULT_SPECULAR:g}, which it has there."
         )
     return notes

@@ -18,12 +18,12 @@ from advsearch.extend import assets
 from advsearch.questions.harden.objects.family import Instance, family
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
-    Draw,
     Paint,
+    ParameterSampler,
     Texels,
-    hexed,
     mix,
     painter,
+    parse_hex_color,
     solid,
     step,
 )
@@ -85,7 +85,7 @@ def _shell(
         row[:, 0], row[:, 1], row[:, 2] = x, y, height(np.full_like(x, share), x, y)
     wrapped_points = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
     column_tangent = np.gradient(wrapped_points, axis=1)[:, 1:-1]
-    normals = shapes.unit(np.cross(column_tangent, np.gradient(points, axis=0)))
+    normals = shapes.normalize(np.cross(column_tangent, np.gradient(points, axis=0)))
     opposite = COLUMNS // 2
     cut = int(COLUMNS * corner)
     patches = []
@@ -275,7 +275,7 @@ def _body_and_cabin() -> list[Patch]:
     }
     for part, openings in OPENINGS.items():
         for name, tag in openings.items():
-            parts[part] = shapes.carved(parts[part], _opening(name), tag)
+            parts[part] = shapes.carve_patches(parts[part], _opening(name), tag)
     return parts["body"] + parts["cabin"]
 
 
@@ -314,15 +314,17 @@ def _wheels() -> list[Patch]:
     for number, side in product(range(5), (-1.0, 1.0)):
         spoke[:, 1] = side * np.array([0.012, 0.018, 0.04])
         turn = shapes.rotation("z", 72.0 * number)
-        wheel += shapes.placed(
+        wheel += shapes.transform_patches(
             shapes.sweep("rim", spoke, section, (1.0, 1.0, 1.15)), turn
         )
     hub = [(0.052, deep), (0.05, half - 0.02), (0.03, half - 0.01), (0.0, half - 0.008)]
-    wheel += shapes.lathe([("rim", shapes.rounded(hub, 0.008, 2))], 20)
+    wheel += shapes.lathe([("rim", shapes.round_corners(hub, 0.008, 2))], 20)
     patches = []
     for axle, side in WHEELS:
         turn = shapes.rotation("y", 17.0 * axle) @ shapes.rotation("x", -90.0 * side)
-        patches += shapes.placed(wheel, turn, (axle, side * (0.852 - TYRE / 2), WHEEL))
+        patches += shapes.transform_patches(
+            wheel, turn, (axle, side * (0.852 - TYRE / 2), WHEEL)
+        )
     return patches
 
 
@@ -364,7 +366,7 @@ def _fittings() -> list[Patch]:
     patches = []
     for side in (1.0, -1.0):  # mirrors
         shell = shapes.box("paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), 0.055, 3)
-        patches += shapes.placed(
+        patches += shapes.transform_patches(
             shell, shapes.rotation("z", -14.0 * side), (0.57, side * 0.93, 1.005)
         )
         patches += shapes.box(
@@ -380,7 +382,9 @@ def _fittings() -> list[Patch]:
         (badge, 78.0, (2.118, 0.0, 0.575)),
         (badge, -80.0, (-2.075, 0.0, 0.86)),
     ):
-        patches += shapes.placed(fitting, shapes.rotation("y", tilt), position)
+        patches += shapes.transform_patches(
+            fitting, shapes.rotation("y", tilt), position
+        )
     for side, x in product((1.0, -1.0), (0.05, -0.92)):  # handles of the doors
         patches += shapes.box(
             "paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1
@@ -388,7 +392,9 @@ def _fittings() -> list[Patch]:
     spoiler = shapes.box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2)
     return [
         *patches,
-        *shapes.placed(spoiler, shapes.rotation("y", 9.0), (-1.60, 0.0, 1.364)),
+        *shapes.transform_patches(
+            spoiler, shapes.rotation("y", 9.0), (-1.60, 0.0, 1.364)
+        ),
     ]
 
 
@@ -411,14 +417,16 @@ def _lacquer(t: Texels, color: Array) -> Array:
     """Paint with the gaps of doors, hood and tailgate."""
     x, y, z = t.xyz.T
     out = np.abs(y)
-    hood = shapes.away_from(
+    hood = shapes.distance_to_polylines(
         x, out, [(0.9, 0.74), (1.5, 0.70), (1.84, 0.58), (1.95, 0.3), (1.97, 0.0)]
     )
-    gate = shapes.away_from(
+    gate = shapes.distance_to_polylines(
         out, z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)]
     )
     gaps = [
-        np.where((out > 0.6) & (z < 1.02), shapes.away_from(x, z, *_DOORS), 9.0),
+        np.where(
+            (out > 0.6) & (z < 1.02), shapes.distance_to_polylines(x, z, *_DOORS), 9.0
+        ),
         np.where((x > 0.8) & (z > 0.6), hood, 9.0),
         np.where(x < -1.7, gate, 9.0),
         # the tank's lid
@@ -427,7 +435,9 @@ def _lacquer(t: Texels, color: Array) -> Array:
         ),
     ]
     fold = np.clip(
-        1.0 - shapes.away_from(x, out, [(0.95, 0.5), (1.9, 0.36)]) / 0.05, 0.0, 1.0
+        1.0 - shapes.distance_to_polylines(x, out, [(0.95, 0.5), (1.9, 0.36)]) / 0.05,
+        0.0,
+        1.0,
     )
     shaded = mix(color, 0.75 * color, 0.4 * np.where((x > 0.8) & (z > 0.7), fold, 0.0))
     return mix(
@@ -438,7 +448,11 @@ def _lacquer(t: Texels, color: Array) -> Array:
 def _panes(t: Texels) -> Array:
     """Paint dark glass with the pillar between the doors, and the seats behind the windscreen."""
     x, y, z = t.xyz.T
-    color = mix(hexed("20272b"), hexed("414d55"), np.clip((z - 0.95) / 0.5, 0.0, 1.0))
+    color = mix(
+        parse_hex_color("20272b"),
+        parse_hex_color("414d55"),
+        np.clip((z - 0.95) / 0.5, 0.0, 1.0),
+    )
     out = np.abs(y)
     seat = np.minimum(
         np.hypot((out - 0.36) / 0.24, (z - 1.0) / 0.2),
@@ -446,21 +460,29 @@ def _panes(t: Texels) -> Array:
     )
     ahead = np.where(x > 0.0, step(1.0 - seat, 0.0, 0.15), 0.0)
     pillar = np.where(out > 0.55, step(0.035 - np.abs(x + 0.25), 0.0, 0.01), 0.0)
-    return mix(color, hexed("0b0c0d"), np.maximum(pillar, ahead))
+    return mix(color, parse_hex_color("0b0c0d"), np.maximum(pillar, ahead))
 
 
 def _lamps(t: Texels) -> Array:
     _, y, z = t.xyz.T
     out = np.abs(y)
     lamp = np.minimum(np.hypot(out - 0.58, z - 0.62), np.hypot(out - 0.71, z - 0.64))
-    base = mix(hexed("9aa4ab"), hexed("f4f7f8"), step(0.032 - lamp, 0.0, 0.01))
-    return mix(base, hexed("3a4045"), step(0.01 - np.abs(lamp - 0.039), 0.0, 0.008))
+    base = mix(
+        parse_hex_color("9aa4ab"),
+        parse_hex_color("f4f7f8"),
+        step(0.032 - lamp, 0.0, 0.01),
+    )
+    return mix(
+        base, parse_hex_color("3a4045"), step(0.01 - np.abs(lamp - 0.039), 0.0, 0.008)
+    )
 
 
 def _tail(t: Texels) -> Array:
     z = t.xyz[:, 2]
     return mix(
-        hexed("8e0d12"), hexed("d8392f"), step(0.018 - np.abs(z - 0.87), 0.0, 0.01)
+        parse_hex_color("8e0d12"),
+        parse_hex_color("d8392f"),
+        step(0.018 - np.abs(z - 0.87), 0.0, 0.01),
     )
 
 
@@ -471,7 +493,7 @@ def _slats(t: Texels) -> Array:
         step(0.006 - np.abs((z % 0.034) - 0.017), 0.0, 0.006),
         0.0,
     )
-    return mix(hexed("17181a"), hexed("8b9095"), slat)
+    return mix(parse_hex_color("17181a"), parse_hex_color("8b9095"), slat)
 
 
 @painter
@@ -490,7 +512,7 @@ def _plate(t: Texels, ground: Array) -> Array:
     strokes = (np.abs(cell_fraction - 0.27) < 0.09) | (
         (cell_fraction < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13)
     )
-    return mix(ground, hexed("16181c"), (field & strokes).astype(np.float64))
+    return mix(ground, parse_hex_color("16181c"), (field & strokes).astype(np.float64))
 
 
 GLASS = assets.Material(roughness=0.04, specular=0.6)
@@ -508,16 +530,16 @@ FINISHES = {
 
 
 @family(metres=1.0, texels=384)
-def car(draw: Draw) -> Instance:
+def car(draw: ParameterSampler) -> Instance:
     """Make a car of random proportions and paint."""
-    color = draw.colour(
+    color = draw.sample_color(
         "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2
     )
     stretch = np.array(
         [draw(1.0, 0.94, 1.07), draw(1.0, 0.96, 1.05), draw(1.0, 0.95, 1.1)]
     )
     patches = [*_body_and_cabin(), *_wheels(), *_wells(), *_fittings()]
-    metal = draw.colour("c4c7ca", "8d9094", "2d2f31", wild=0.0)
+    metal = draw.sample_color("c4c7ca", "8d9094", "2d2f31", wild=0.0)
     paints: dict[str, Paint] = {
         "paint": _lacquer(color),
         "glass": _panes,
@@ -526,12 +548,12 @@ def car(draw: Draw) -> Instance:
         "rubber": solid("1c1c1d"),
         "rim": solid(metal),
         "trim": _slats,
-        "plate": _plate(draw.colour("f2f2ec", "f0d264", wild=0.0)),
+        "plate": _plate(draw.sample_color("f2f2ec", "f0d264", wild=0.0)),
         "well": solid("0a0a0b"),
     }
     detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
     return Instance(
-        shapes.stretched(patches, stretch),
+        shapes.stretch_patches(patches, stretch),
         paints,
         FINISHES["paint"],
         detail,

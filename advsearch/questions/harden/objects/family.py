@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from advsearch.extend import assets, workbench
 from advsearch.questions.harden.objects.shapes import Array, Patch
-from advsearch.questions.harden.objects.textures import Draw, Paint, Texels
+from advsearch.questions.harden.objects.textures import Paint, ParameterSampler, Texels
 
 # ---- the atlas
 # ----------------------------------------------------------------------------------
@@ -18,7 +18,7 @@ from advsearch.questions.harden.objects.textures import Draw, Paint, Texels
 # large all over the object. `GUTTER` texels of their own color around them prevent
 # bleeding when the texture is filtered or its resolution is halved.
 
-SIZE = 256
+DEFAULT_ATLAS_SIZE = 256
 """Default width of the atlas in texels."""
 GUTTER = 2
 """Texels around each chart, on every side."""
@@ -27,7 +27,7 @@ DECIMALS = 6
 
 
 @dataclass(frozen=True)
-class AtlasPlace:
+class AtlasRectangle:
     """Rectangle of a chart in the atlas.
 
     Attributes:
@@ -54,7 +54,7 @@ class _Shelf:
 
 def _shelves(
     sizes: Sequence[tuple[float, float]], scale: float, side: int
-) -> list[AtlasPlace] | None:
+) -> list[AtlasRectangle] | None:
     """Pack rectangles (w, h), w >= h, on shelves of a square, the highest first.
 
     None if they do not fit.
@@ -69,7 +69,7 @@ def _shelves(
     order = sorted(
         range(len(cells)), key=lambda index: (-cells[index][1], -cells[index][0], index)
     )
-    rectangles: dict[int, AtlasPlace] = {}
+    rectangles: dict[int, AtlasRectangle] = {}
     shelves: list[_Shelf] = []
     top = 0
     for index in order:
@@ -85,12 +85,16 @@ def _shelves(
             shelf = _Shelf(top, height, 0)
             shelves.append(shelf)
             top += height
-        rectangles[index] = AtlasPlace(shelf.filled, shelf.bottom, width, height, False)
+        rectangles[index] = AtlasRectangle(
+            shelf.filled, shelf.bottom, width, height, False
+        )
         shelf.filled += width
     return [rectangles[index] for index in range(len(cells))]
 
 
-def pack(sizes: Sequence[tuple[float, float]], side: int = SIZE) -> list[AtlasPlace]:
+def pack_charts(
+    sizes: Sequence[tuple[float, float]], side: int = DEFAULT_ATLAS_SIZE
+) -> list[AtlasRectangle]:
     """Pack charts of size (width, height) into a square at the largest scale that fits.
 
     The scale is found by bisection.
@@ -121,11 +125,11 @@ def pack(sizes: Sequence[tuple[float, float]], side: int = SIZE) -> list[AtlasPl
     ]
 
 
-def painted(
+def paint_atlas(
     patches: Sequence[Patch],
-    places: Sequence[AtlasPlace],
+    rectangles: Sequence[AtlasRectangle],
     paints: Mapping[str, Paint],
-    side: int = SIZE,
+    side: int = DEFAULT_ATLAS_SIZE,
 ) -> npt.NDArray[np.float32]:
     """Paint the texture (side, side, 3), display-referred sRGB, row 0 at the top.
 
@@ -133,7 +137,7 @@ def painted(
     """
     image = np.zeros((side, side, 3))
     is_used = np.zeros((side, side), dtype=bool)
-    for patch, rectangle in zip(patches, places, strict=True):
+    for patch, rectangle in zip(patches, rectangles, strict=True):
         # Texels are in rows from the bottom.
         a = np.tile(_texel_centers(rectangle.width), rectangle.height)
         b = np.repeat(_texel_centers(rectangle.height), rectangle.width)
@@ -157,8 +161,10 @@ def _texel_centers(count: int) -> Array:
     return np.clip((np.arange(count) + 0.5 - GUTTER) / (count - 2 * GUTTER), 0.0, 1.0)
 
 
-def joined(
-    patches: Sequence[Patch], places: Sequence[AtlasPlace], side: int = SIZE
+def join_patches(
+    patches: Sequence[Patch],
+    rectangles: Sequence[AtlasRectangle],
+    side: int = DEFAULT_ATLAS_SIZE,
 ) -> assets.Mesh:
     """Join patches into a mesh of largest extent 1, centered and standing on z = 0.
 
@@ -166,13 +172,13 @@ def joined(
     """
     first_vertex = np.cumsum([0] + [len(patch.vertices) for patch in patches[:-1]])
     vertices = np.concatenate([patch.vertices for patch in patches])
-    origin, extent = assets.footing(vertices)
+    origin, extent = assets.find_footing(vertices)
     vertices = (vertices - origin) / extent
     normals = np.concatenate([patch.normals for patch in patches])
     uvs = np.concatenate(
         [
             _atlas_coordinates(patch, rectangle, side)
-            for patch, rectangle in zip(patches, places, strict=True)
+            for patch, rectangle in zip(patches, rectangles, strict=True)
         ]
     )
     faces = np.concatenate(
@@ -192,7 +198,7 @@ def joined(
     )
 
 
-def _atlas_coordinates(patch: Patch, rectangle: AtlasPlace, side: int) -> Array:
+def _atlas_coordinates(patch: Patch, rectangle: AtlasRectangle, side: int) -> Array:
     """Return the texture coordinates (V, 2) of a patch's vertices in the atlas."""
     chart_uvs = patch.uvs
     if rectangle.is_rotated:
@@ -242,15 +248,15 @@ class ObjectFamily:
 
     Attributes:
         name: of the class, usable on the command line.
-        make: builds an instance from a `Draw`.
+        make: builds an instance from a `ParameterSampler`.
         metres: length of the unit in which it is built.
         texels: width of its texture.
     """
 
     name: str
-    make: Callable[[Draw], Instance]
+    make: Callable[[ParameterSampler], Instance]
     metres: float
-    texels: int = SIZE
+    texels: int = DEFAULT_ATLAS_SIZE
 
     @property
     def label(self) -> str:
@@ -263,7 +269,7 @@ class ObjectFamily:
         The mesh has largest extent 1 and rests on z = 0. The same state of the
         generator gives the same asset.
         """
-        instance = self.make(Draw(rng))
+        instance = self.make(ParameterSampler(rng))
         if instance.finishes:
             instance = _sort_by_material(instance)
         patches = instance.patches
@@ -271,13 +277,13 @@ class ObjectFamily:
         for patch in patches:
             detail = instance.detail.get(patch.tag, 1.0)
             chart_sizes.append((patch.size[0] * detail, patch.size[1] * detail))
-        rectangles = pack(chart_sizes, self.texels)
-        mesh = joined(patches, rectangles, self.texels)
+        rectangles = pack_charts(chart_sizes, self.texels)
+        mesh = join_patches(patches, rectangles, self.texels)
         surface = None
         if instance.finishes:
             materials = _faces_by_material(patches)
             mesh = replace(mesh, materials=materials, rig=instance.rig)
-            surface = workbench.library.finished(
+            surface = workbench.library.make_finished_surface(
                 mesh, instance.finishes, instance.material
             )
         vertices = np.concatenate([patch.vertices for patch in patches])
@@ -285,7 +291,7 @@ class ObjectFamily:
         return assets.ObjectAsset(
             name=self.name,
             mesh=mesh,
-            base_color=painted(patches, rectangles, instance.paints, self.texels),
+            base_color=paint_atlas(patches, rectangles, instance.paints, self.texels),
             material=instance.material,
             label=self.label,
             source=workbench.library.BUNDLED_OBJECT,
@@ -303,7 +309,7 @@ def _sort_by_material(instance: Instance) -> Instance:
     return replace(instance, patches=patches)
 
 
-def _faces_by_material(patches: Sequence[Patch]) -> dict[str, assets.Ints]:
+def _faces_by_material(patches: Sequence[Patch]) -> dict[str, assets.IntArray]:
     """Return the indices of the faces of each tag in the joined mesh."""
     tag_of_face = np.repeat(
         [patch.tag for patch in patches], [len(patch.faces) for patch in patches]
@@ -315,16 +321,19 @@ def _faces_by_material(patches: Sequence[Patch]) -> dict[str, assets.Ints]:
 
 
 def family(
-    metres: float, texels: int = SIZE
-) -> Callable[[Callable[[Draw], Instance]], ObjectFamily]:
+    metres: float, texels: int = DEFAULT_ATLAS_SIZE
+) -> Callable[[Callable[[ParameterSampler], Instance]], ObjectFamily]:
     """Decorate a function that makes instances into a family with the function's name."""
     return lambda make: ObjectFamily(
         make.__name__.replace("_", "-"), make, metres, texels
     )
 
 
-def finish(
-    draw: Draw, roughness: float, clearcoat: float = 0.0, spread: float = 0.2
+def sample_material(
+    draw: ParameterSampler,
+    roughness: float,
+    clearcoat: float = 0.0,
+    spread: float = 0.2,
 ) -> assets.Material:
     """Sample a material with a roughness within `spread`, and sometimes another coat."""
     sampled_roughness = draw(roughness, roughness - spread, roughness + spread)

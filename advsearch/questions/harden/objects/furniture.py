@@ -7,20 +7,20 @@ from itertools import product
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
-from advsearch.questions.harden.objects.family import Instance, family, finish
+from advsearch.questions.harden.objects.family import Instance, family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
     Color,
-    Draw,
     Paint,
+    ParameterSampler,
     between,
     checks,
     clouded,
     dots,
     gradient,
-    hexed,
-    natural,
     over,
+    paint_or_random,
+    parse_hex_color,
     rings,
     shade,
     solid,
@@ -50,7 +50,7 @@ def _post(
 
 
 @family(metres=0.01)
-def chair(draw: Draw) -> Instance:
+def chair(draw: ParameterSampler) -> Instance:
     """Faces +x; the back stands at -x."""
     wide = draw(43.0, 36.0, 50.0)
     deep = draw(42.0, 36.0, 48.0)
@@ -109,30 +109,34 @@ def chair(draw: Draw) -> Instance:
             "cross", (0.0, -side_y, low), (0.0, side_y, low), section, thinner
         )
     patches += _chair_back(draw, x, y, seat, total, lean, leg, section)
-    rotated = shapes.placed(patches, shapes.rotation("z", draw(8.0, -25.0, 25.0)))
+    rotated = shapes.transform_patches(
+        patches, shapes.rotation("z", draw(8.0, -25.0, 25.0))
+    )
     paints = _chair_paints(draw, total)
-    return Instance(rotated, paints, finish(draw, 0.45, 0.2))
+    return Instance(rotated, paints, sample_material(draw, 0.45, 0.2))
 
 
-def _chair_paints(draw: Draw, total: float) -> dict[str, Paint]:
+def _chair_paints(draw: ParameterSampler, total: float) -> dict[str, Paint]:
     """Sample the paints of a chair of a height."""
     offset = draw.offset()
-    timber = draw.colour("a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0)
-    paint_color = draw.colour(
+    timber = draw.sample_color(
+        "a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0
+    )
+    paint_color = draw.sample_color(
         "f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040"
     )
     painted = draw.chance(0.4)
-    wild = natural(draw, total, solid(paint_color), 0.5)
+    wild = paint_or_random(draw, total, solid(paint_color), 0.5)
 
     def grain(axis: int) -> Paint:
         return wild if painted else wood(timber, 3.2, offset, axis=axis, contrast=0.36)
 
-    fabric = draw.colour("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
+    fabric = draw.sample_color("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
     cover = draw.pick(
         clouded(fabric, 0.8, 1.5, offset),
         stripes(fabric, shade(fabric, 1.5), 6.0),
-        checks(fabric, hexed("efe6d4"), 4.0),
-        dots(solid(fabric), hexed("f4efe4"), 6.0),
+        checks(fabric, parse_hex_color("efe6d4"), 4.0),
+        dots(solid(fabric), parse_hex_color("f4efe4"), 6.0),
     )
     seat_paint = cover if draw.chance(0.25) else grain(0)
     return {
@@ -145,7 +149,7 @@ def _chair_paints(draw: Draw, total: float) -> dict[str, Paint]:
 
 
 def _chair_back(
-    draw: Draw,
+    draw: ParameterSampler,
     x: float,
     y: float,
     seat: float,
@@ -176,7 +180,7 @@ def _chair_back(
     def slat(
         tag: str, z: float, width: float, height: float, shift: float = 0.0
     ) -> list[Patch]:
-        return shapes.placed(
+        return shapes.transform_patches(
             shapes.box(tag, (0.0, 0.0, 0.0), (depth, width, height), 0.5),
             tilt,
             (at(z), shift, z),
@@ -217,7 +221,7 @@ def _chair_back(
 
 
 def _shade(
-    draw: Draw, low: float, high: float, wide: float, narrow: float
+    draw: ParameterSampler, low: float, high: float, wide: float, narrow: float
 ) -> list[Patch]:
     """An open lampshade with a thin wall, standing free from `low` to `high`."""
     wall = 0.25
@@ -228,7 +232,7 @@ def _shade(
     )
     inner = (outer - np.array([wall, 0.0]))[::-1]
     pieces = [
-        ("shade", shapes.dense(outer, 2.0)),
+        ("shade", shapes.subdivide(outer, 2.0)),
         ("rim", [outer[-1], inner[0]]),
         ("lining", inner),
         ("rim", [inner[-1], outer[0]]),
@@ -237,7 +241,7 @@ def _shade(
 
 
 def _lamp_base(
-    draw: Draw, style: str, low: float, radius: float, stem: float
+    draw: ParameterSampler, style: str, low: float, radius: float, stem: float
 ) -> list[Patch]:
     """Create the base of a lamp of one of several kinds."""
     under = [(0.0, 0.0), (radius - 0.4, 0.0)]
@@ -252,7 +256,9 @@ def _lamp_base(
             (stem, thick * 2.2),
             top[0],
         ]
-        side = shapes.dense(shapes.rounded(corners, [0.3, 0.5, 1.0, 1.2], 5), 1.6)
+        side = shapes.subdivide(
+            shapes.round_corners(corners, [0.3, 0.5, 1.0, 1.2], 5), 1.6
+        )
         return shapes.lathe([("base", under), ("base", side), ("base", top)], 44)
     belly = radius * draw(1.12, 0.95, 1.4)
     at = draw(0.38, 0.28, 0.6) * low
@@ -268,7 +274,7 @@ def _lamp_base(
         (stem, 0.93 * low),
     ]
     body = shapes.spline(knots, 34)
-    ring = shapes.rounded(
+    ring = shapes.round_corners(
         [under[-1], (radius, 0.2), (radius, 1.2), knots[0]], [0.15, 0.3], 3
     )
     neck = [knots[-1], top[0]]
@@ -285,12 +291,12 @@ def _lamp_base(
 
 
 def _shade_paint(
-    draw: Draw, linen: Color, offset: Array, low: float, total: float
+    draw: ParameterSampler, linen: Color, offset: Array, low: float, total: float
 ) -> Paint:
     """Sample the paint of a lamp's shade between two heights."""
     weave = clouded(linen, 0.93, 1.2, offset)
     kind = draw.pick("plain", "band", "stripes", "dots", "rings", "gradient")
-    accent = draw.colour("b08d3c", "7a1f2b", "23395d", "efe6cf")
+    accent = draw.sample_color("b08d3c", "7a1f2b", "23395d", "efe6cf")
     if kind == "band":
         for band in (between(0.0, low + 1.4), between(total - 1.4, 2 * total)):
             weave = over(weave, band, solid(accent))
@@ -305,11 +311,11 @@ def _shade_paint(
     else:
         for hem in (between(0.0, low + 0.5), between(total - 0.5, 2 * total)):
             weave = over(weave, hem, solid(shade(linen, 0.75)))
-    return natural(draw, total, weave, 0.3)
+    return paint_or_random(draw, total, weave, 0.3)
 
 
 @family(metres=0.01)
-def lamp(draw: Draw) -> Instance:
+def lamp(draw: ParameterSampler) -> Instance:
     """Make a table lamp of random proportions, shade and base."""
     total = draw(48.0, 42.0, 58.0)
     tall = draw(20.0, 14.0, 24.0)
@@ -332,7 +338,7 @@ def lamp(draw: Draw) -> Instance:
             [(0.0, 0.0, ring_z), (inside, 0.0, ring_z)],
             shapes.ellipse(0.22, 0.22, 8),
         )
-        patches += shapes.placed(spoke, shapes.rotation("z", angle))
+        patches += shapes.transform_patches(spoke, shapes.rotation("z", angle))
     rod = [(0, 0, z) for z in (low + 0.2 * tall, ring_z, ring_z + 0.8, ring_z + 1.0)]
     patches += shapes.sweep(
         "base",
@@ -342,15 +348,15 @@ def lamp(draw: Draw) -> Instance:
         first=(1.0, 0.0, 0.0),
     )
     offset = draw.offset()
-    linen = draw.colour(
+    linen = draw.sample_color(
         "f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25
     )
     cloth = _shade_paint(draw, linen, offset, low, total)
-    clay = draw.colour(
+    clay = draw.sample_color(
         "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b"
     )
-    body = natural(draw, total, clouded(clay, 1.3, 4.0, offset), 0.35)
-    metal = draw.colour("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
+    body = paint_or_random(draw, total, clouded(clay, 1.3, 4.0, offset), 0.35)
+    metal = draw.sample_color("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
     paints = {
         "shade": cloth,
         "rim": solid(shade(linen, 0.8)),
@@ -360,4 +366,4 @@ def lamp(draw: Draw) -> Instance:
         "foot": solid(metal),
         "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
     }
-    return Instance(patches, paints, finish(draw, 0.4, 0.3), {"lining": 0.6})
+    return Instance(patches, paints, sample_material(draw, 0.4, 0.3), {"lining": 0.6})

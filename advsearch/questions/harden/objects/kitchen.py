@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
-from advsearch.questions.harden.objects.family import Instance, family, finish
+from advsearch.questions.harden.objects.family import Instance, family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch, Points
 from advsearch.questions.harden.objects.textures import (
-    Draw,
     Paint,
+    ParameterSampler,
     Texels,
     between,
     clouded,
     dots,
-    natural,
     over,
+    paint_or_random,
     rings,
     shade,
     solid,
@@ -26,7 +26,7 @@ from advsearch.questions.harden.objects.textures import (
 )
 
 
-def _spout(draw: Draw, radius: float, height: float) -> list[Patch]:
+def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
     """A spout along +x with an open, hollow end."""
     style = draw.pick("curved", "straight")
     start = np.array([radius * 0.72, 0.0, height * draw(0.34, 0.26, 0.42)])
@@ -40,7 +40,7 @@ def _spout(draw: Draw, radius: float, height: float) -> list[Patch]:
     root = draw(1.75, 1.3, 2.2)
     end = draw(0.72, 0.55, 0.95)
     scale = end + (root - end) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
-    tangent, first, second = shapes.frames(path, (0.0, 1.0, 0.0))
+    tangent, first, second = shapes.compute_frames(path, (0.0, 1.0, 0.0))
     order = np.array([*range(18), 17, 17, 17, 16, 15, 14, 13])
     inner = scale[[17, 16, 15, 14, 13]] - 0.24
     radii = np.concatenate(
@@ -59,7 +59,7 @@ def _spout(draw: Draw, radius: float, height: float) -> list[Patch]:
 
 
 @family(metres=0.01)
-def teapot(draw: Draw) -> Instance:
+def teapot(draw: ParameterSampler) -> Instance:
     """Make a teapot with spout, handle and lid of random proportions."""
     radius = draw(7.2, 6.4, 8.0)
     height = draw(10.2, 8.0, 12.5)
@@ -68,14 +68,16 @@ def teapot(draw: Draw) -> Instance:
     patches = [
         *body,
         *_spout(draw, radius, height),
-        *shapes.placed(grip, shapes.rotation("z", 180.0)),
+        *shapes.transform_patches(grip, shapes.rotation("z", 180.0)),
     ]
-    patches = shapes.placed(patches, shapes.rotation("z", 118.0))
+    patches = shapes.transform_patches(patches, shapes.rotation("z", 118.0))
     paints = _teapot_paints(draw, height)
-    return Instance(patches, paints, finish(draw, 0.25, 0.7), {"base": 0.6})
+    return Instance(patches, paints, sample_material(draw, 0.25, 0.7), {"base": 0.6})
 
 
-def _teapot_body(draw: Draw, radius: float, height: float) -> tuple[Array, list[Patch]]:
+def _teapot_body(
+    draw: ParameterSampler, radius: float, height: float
+) -> tuple[Array, list[Patch]]:
     """Return the profile of the side, and the body with its lid and knob."""
     foot = radius * draw(0.58, 0.5, 0.75)
     mouth = radius * draw(0.48, 0.42, 0.6)
@@ -132,13 +134,13 @@ def _teapot_body(draw: Draw, radius: float, height: float) -> tuple[Array, list[
 
 
 def _teapot_handle(
-    draw: Draw, side: Array, radius: float, height: float
+    draw: ParameterSampler, side: Array, radius: float, height: float
 ) -> list[Patch]:
     """Create the handle on the +x side of a body with a profile (K, 2)."""
     span = draw(0.9, 0.75, 1.0)
     high = height * 0.84
     low = height * (0.84 - 0.62 * span)
-    top_root, low_root = (shapes.at_height(side, z) - 0.25 for z in (high, low))
+    top_root, low_root = (shapes.radius_at_height(side, z) - 0.25 for z in (high, low))
     reach = radius * draw(0.72, 0.5, 0.9)
     lift = draw(0.05, -0.02, 0.2) * height
     knots = [
@@ -152,20 +154,20 @@ def _teapot_handle(
     section = shapes.ellipse(draw(0.5, 0.4, 0.7), draw(0.62, 0.45, 0.85), 16)
     return shapes.sweep(
         "handle",
-        shapes.upright(shapes.spline(knots, 26)),
+        shapes.to_xz_plane(shapes.spline(knots, 26)),
         section,
         1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3,
     )
 
 
-def _teapot_paints(draw: Draw, height: float) -> dict[str, Paint]:
+def _teapot_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
     """Sample the paints of a teapot."""
     offset = draw.offset()
-    clay = draw.colour(
+    clay = draw.sample_color(
         "7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0"
     )
     glaze = clouded(clay, 1.25, 3.5, offset, 1.6)
-    second = draw.colour("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
+    second = draw.sample_color("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
     kind = draw.pick("bands", "plain", "dots", "stripes", "rings", "speckle")
     if kind == "bands":
         paint = over(
@@ -184,7 +186,7 @@ def _teapot_paints(draw: Draw, height: float) -> dict[str, Paint]:
         paint = speckled(glaze, second, 0.5, offset)
     else:
         paint = glaze
-    paint = natural(draw, height + 4.0, paint)
+    paint = paint_or_random(draw, height + 4.0, paint)
     trim = draw.pick(glaze, solid(second), paint)
     return {
         "base": solid("a98663"),
@@ -197,7 +199,7 @@ def _teapot_paints(draw: Draw, height: float) -> dict[str, Paint]:
 
 
 @family(metres=0.01)
-def frying_pan(draw: Draw) -> Instance:
+def frying_pan(draw: ParameterSampler) -> Instance:
     """Make a frying pan with a random handle."""
     base = draw(10.5, 9.0, 11.5)
     rim = draw(13.0, 12.2, 14.5)
@@ -218,7 +220,7 @@ def frying_pan(draw: Draw) -> Instance:
     root = np.array([rim - 0.6, 0.0, 0.78 * depth])
     rise = draw(2.6, 0.6, 4.5)
     grip = _pan_handle(draw, root, length, rise)
-    inner_radius = shapes.at_height(side, 0.72 * depth) - wall
+    inner_radius = shapes.radius_at_height(side, 0.72 * depth) - wall
     rivets = _pan_rivets(inner_radius, 0.72 * depth)
     spine = [
         (rim - 1.4, 0.72 * depth),
@@ -227,19 +229,21 @@ def frying_pan(draw: Draw) -> Instance:
     ]
     bracket = shapes.sweep(
         "bracket",
-        shapes.upright(np.array(spine)),
+        shapes.to_xz_plane(np.array(spine)),
         shapes.rectangle(0.7, 3.0, 0.25),
         (1.0, 1.0, 0.62),
         caps=True,
     )
-    patches = shapes.placed(
+    patches = shapes.transform_patches(
         [*body, *grip, *rivets, *bracket], shapes.rotation("z", 118.0)
     )
     paints = _pan_paints(draw, rim, depth)
-    return Instance(patches, paints, finish(draw, 0.38, 0.3), {"base": 0.5})
+    return Instance(patches, paints, sample_material(draw, 0.38, 0.3), {"base": 0.5})
 
 
-def _pan_handle(draw: Draw, root: Array, length: float, rise: float) -> list[Patch]:
+def _pan_handle(
+    draw: ParameterSampler, root: Array, length: float, rise: float
+) -> list[Patch]:
     """Create a handle along x from a root (3,), which rises and has a round end."""
     knots = [
         (0.0, 0.0),
@@ -247,7 +251,7 @@ def _pan_handle(draw: Draw, root: Array, length: float, rise: float) -> list[Pat
         (0.6 * length, rise),
         (length, rise * draw(1.05, 0.8, 1.2)),
     ]
-    path = shapes.spline(root + shapes.upright(np.array(knots)), 26)
+    path = shapes.spline(root + shapes.to_xz_plane(np.array(knots)), 26)
     t = np.linspace(0.0, 1.0, 26)
     width = draw(1.15, 0.85, 1.5)
     thick = draw(0.62, 0.45, 0.9)
@@ -270,15 +274,15 @@ def _pan_rivets(radius: float, height: float) -> list[Patch]:
     """Create the two rivets of the bracket on the inside of a pan."""
     center = (radius + 0.02, 0.0, height)
     rivet = shapes.sphere("rivet", 0.38, center, rows=8, columns=12)
-    left = shapes.placed(rivet, offset=(0.0, -1.1, 0.0))
-    right = shapes.placed(rivet, offset=(0.0, 1.1, 0.0))
+    left = shapes.transform_patches(rivet, offset=(0.0, -1.1, 0.0))
+    right = shapes.transform_patches(rivet, offset=(0.0, 1.1, 0.0))
     return left + right
 
 
-def _pan_paints(draw: Draw, rim: float, depth: float) -> dict[str, Paint]:
+def _pan_paints(draw: ParameterSampler, rim: float, depth: float) -> dict[str, Paint]:
     """Sample the paints of a pan with a radius and a depth."""
     offset = draw.offset()
-    coat = draw.colour("2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2)
+    coat = draw.sample_color("2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2)
 
     def turned(t: Texels) -> Array:
         """Return the mask of faint rings, as turning leaves."""
@@ -292,22 +296,26 @@ def _pan_paints(draw: Draw, rim: float, depth: float) -> dict[str, Paint]:
     )
     if draw.chance(0.4, True):
         inside = over(inside, turned, solid(shade(coat, 1.6)))
-    outer = draw.colour("a9231f", "2b2c2e", "9a9da1", "2f5d7c", "3d6b4a", "d9822b")
+    outer = draw.sample_color(
+        "a9231f", "2b2c2e", "9a9da1", "2f5d7c", "3d6b4a", "d9822b"
+    )
     # darker towards the bottom, with a dark line at the rim
     enamel = clouded(outer, 0.85, 5.0, offset)
     enamel = over(
         enamel, between(-1.0, 0.25 * depth, soft=0.6 * depth), solid(shade(outer, 0.6))
     )
     enamel = over(enamel, between(depth - 0.1, 2 * depth, soft=0.15), solid("2b2c2e"))
-    outside = natural(draw, 2 * rim, enamel, 0.3)
-    inside = natural(draw, 2 * rim, inside, 0.2)
+    outside = paint_or_random(draw, 2 * rim, enamel, 0.3)
+    inside = paint_or_random(draw, 2 * rim, inside, 0.2)
     style = draw.pick("black", "wood", "wild")
     handle_paints = {
-        "black": solid(draw.colour("1b1b1d", "2a2a2c", wild=0.1)),
-        "wood": wood(draw.colour("8a5a32", "b98550", wild=0.0), 1.4, offset, axis=0),
-        "wild": solid(draw.colour("a9231f")),
+        "black": solid(draw.sample_color("1b1b1d", "2a2a2c", wild=0.1)),
+        "wood": wood(
+            draw.sample_color("8a5a32", "b98550", wild=0.0), 1.4, offset, axis=0
+        ),
+        "wild": solid(draw.sample_color("a9231f")),
     }
-    steel = solid(draw.colour("b9bcc0", "8c8f94", wild=0.1))
+    steel = solid(draw.sample_color("b9bcc0", "8c8f94", wild=0.1))
     paints = {
         "outside": outside,
         "inside": inside,
@@ -315,5 +323,5 @@ def _pan_paints(draw: Draw, rim: float, depth: float) -> dict[str, Paint]:
         "rivet": steel,
         "bracket": steel,
     }
-    paints["base"] = solid(draw.colour("77797c", "2b2c2e"))
+    paints["base"] = solid(draw.sample_color("77797c", "2b2c2e"))
     return paints

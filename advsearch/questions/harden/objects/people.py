@@ -12,14 +12,14 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from advsearch.extend import assets, workbench
 from advsearch.questions.harden.objects.family import Instance, family
-from advsearch.questions.harden.objects.shapes import Array, Patch, Rest
+from advsearch.questions.harden.objects.shapes import Array, ChartToPoints, Patch
 from advsearch.questions.harden.objects.textures import (
-    Draw,
+    ParameterSampler,
     Texels,
-    hexed,
     mix,
     noise,
     painter,
+    parse_hex_color,
     step,
 )
 
@@ -33,7 +33,7 @@ FINISHES = {
 }
 
 
-def _rest(charts: Array, points: Array) -> Rest:
+def _rest(charts: Array, points: Array) -> ChartToPoints:
     """Return the function from chart coordinates to points of the reference body.
 
     That stands as MakeHuman's does, whatever this body is like.
@@ -75,7 +75,7 @@ def _patches(person: Any) -> list[Patch]:
     np.add.at(
         normal_sum,
         index[all_faces].reshape(-1),
-        np.repeat(assets.face_vectors(vertices[all_faces]), 3, axis=0),
+        np.repeat(assets.compute_area_vectors(vertices[all_faces]), 3, axis=0),
     )
     normals = normal_sum[index]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -150,7 +150,7 @@ def _strands(t: Texels, color: Array) -> Array:
 
 @painter
 def _leather(t: Texels, color: Array) -> Array:
-    return mix(color, hexed("cfcac0"), step(0.012 - t.xyz[:, 2], 0.0, 0.004))
+    return mix(color, parse_hex_color("cfcac0"), step(0.012 - t.xyz[:, 2], 0.0, 0.004))
 
 
 @painter
@@ -162,12 +162,16 @@ def _irises(t: Texels, color: Array) -> Array:
         np.hypot(np.abs(y) - 0.031, z - float(0.5 * (z.min() + z.max()))),
         1.0,
     )
-    iris = mix(hexed("e6e2dc"), color, step(0.0065 - pupil_distance, 0.0, 0.001))
-    return mix(iris, hexed("101010"), step(0.003 - pupil_distance, 0.0, 0.001))
+    iris = mix(
+        parse_hex_color("e6e2dc"), color, step(0.0065 - pupil_distance, 0.0, 0.001)
+    )
+    return mix(
+        iris, parse_hex_color("101010"), step(0.003 - pupil_distance, 0.0, 0.001)
+    )
 
 
 @family(metres=1.0, texels=512)
-def person(draw: Draw) -> Instance:
+def person(draw: ParameterSampler) -> Instance:
     """Make a person of random phenotype, pose and clothes."""
     is_woman = draw.chance(0.5)
     gender = 0.0 if is_woman else 1.0
@@ -181,22 +185,28 @@ def person(draw: Draw) -> Instance:
         "walk": draw(0.0, 0.0, 360.0),
     }
     body = workbench.library.make_person(phenotype)
-    skin = hexed(draw.pick("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4"))
-    hair = hexed(draw.pick("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c"))
+    skin = parse_hex_color(
+        draw.pick("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4")
+    )
+    hair = parse_hex_color(draw.pick("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c"))
     paints = {
         "shirt": _woven(
-            draw.colour("5b86b8", "c8c4ba", "b04038", "3f6b4a", "d0a83e", "2f3338"),
+            draw.sample_color(
+                "5b86b8", "c8c4ba", "b04038", "3f6b4a", "d0a83e", "2f3338"
+            ),
             0.16,
         ),
         "trousers": _jeans(
-            draw.colour("31374a", "4a4640", "1f2226", "6b6152", "5a6270", wild=0.15)
+            draw.sample_color(
+                "31374a", "4a4640", "1f2226", "6b6152", "5a6270", wild=0.15
+            )
         ),
         "skin": _face(skin, hair),
         "hair": _strands(hair),
         "shoes": _leather(
-            draw.colour("4a3324", "1d1d1f", "8a8680", "5b2f24", wild=0.15)
+            draw.sample_color("4a3324", "1d1d1f", "8a8680", "5b2f24", wild=0.15)
         ),
-        "eyes": _irises(hexed(draw.pick("4a3424", "5a7a94", "5f6f4a"))),
+        "eyes": _irises(parse_hex_color(draw.pick("4a3424", "5a7a94", "5f6f4a"))),
     }
     detail = {"skin": 0.8, "shoes": 0.8, "shirt": 1.15}
     return Instance(

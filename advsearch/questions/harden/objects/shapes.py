@@ -27,25 +27,25 @@ Array: TypeAlias = npt.NDArray[np.float64]
 Points: TypeAlias = Array | Sequence[Sequence[float] | Array]
 
 
-def unit(vectors: Array) -> Array:
+def normalize(vectors: Array) -> Array:
     """Normalize vectors (..., 3) or (..., 2); zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)
 
 
-def at_height(profile: Array, height: float) -> float:
+def radius_at_height(profile: Array, height: float) -> float:
     """Return the radius of a profile (K, 2) of points (r, z), with rising z, at a height."""
     return float(np.interp(height, profile[:, 1], profile[:, 0]))
 
 
-def lengths(curve: Array) -> Array:
+def arc_lengths(curve: Array) -> Array:
     """Return the arc length (K,) from the start of a polyline (K, D) to each point."""
     return np.concatenate(
         [[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
     )
 
 
-def away_from(x: Array, y: Array, *paths: Points) -> Array:
+def distance_to_polylines(x: Array, y: Array, *paths: Points) -> Array:
     """Return the distance of points (N,) to the nearest of several polylines (K, 2)."""
     distance = np.full(len(x), np.inf)
     for (x0, y0), (x1, y1) in chain.from_iterable(map(pairwise, paths)):
@@ -56,7 +56,7 @@ def away_from(x: Array, y: Array, *paths: Points) -> Array:
     return distance
 
 
-def upright(curve: Array) -> Array:
+def to_xz_plane(curve: Array) -> Array:
     """Return a plane curve (K, 2) as one (K, 3) in the plane of x and z."""
     return np.insert(curve, 1, 0.0, axis=1)
 
@@ -77,7 +77,7 @@ def spline(points: Points, count: int) -> Array:
     Its knots are spaced by chord length.
     """
     knots = np.asarray(points, dtype=np.float64)
-    arc_length = lengths(knots)
+    arc_length = arc_lengths(knots)
     return np.asarray(
         CubicHermiteSpline(arc_length, knots, np.gradient(knots, arc_length, axis=0))(
             np.linspace(0.0, arc_length[-1], count)
@@ -85,7 +85,9 @@ def spline(points: Points, count: int) -> Array:
     )
 
 
-def rounded(corners: Points, radius: float | Sequence[float], steps: int = 5) -> Array:
+def round_corners(
+    corners: Points, radius: float | Sequence[float], steps: int = 5
+) -> Array:
     """Round the inner corners of an open polyline (K, D).
 
     Args:
@@ -112,8 +114,8 @@ def rounded(corners: Points, radius: float | Sequence[float], steps: int = 5) ->
         if reach <= 1e-9:
             rounded_points.append(corner)
             continue
-        start = corner + unit(to_previous) * reach
-        end = corner + unit(to_next) * reach
+        start = corner + normalize(to_previous) * reach
+        end = corner + normalize(to_next) * reach
         t = np.linspace(0.0, 1.0, steps + 1)[:, None]
         rounded_points.extend(
             (1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end
@@ -122,7 +124,7 @@ def rounded(corners: Points, radius: float | Sequence[float], steps: int = 5) ->
     return np.array(rounded_points)
 
 
-def dense(points: Points, longest: float) -> Array:
+def subdivide(points: Points, longest: float) -> Array:
     """Divide the edges of a polyline that are longer than `longest` into equal pieces."""
     curve = np.asarray(points, dtype=np.float64)
     parts = [curve[:1]]
@@ -143,7 +145,7 @@ def polygon(sides: int, bevel: float = 0.12, steps: int = 2) -> Array:
     """
     angle = 2 * np.pi * (np.arange(sides + 2) - 0.5) / sides - np.pi / 2
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return rounded(ring, bevel, steps)[1:-1]
+    return round_corners(ring, bevel, steps)[1:-1]
 
 
 def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Array:
@@ -158,7 +160,7 @@ def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Arra
         (half_width, -half_height),
         (half_width, half_height),
     ]
-    return rounded(corners, bevel, steps)[1:-1]
+    return round_corners(corners, bevel, steps)[1:-1]
 
 
 def ellipse(width: float, height: float, count: int = 20) -> Array:
@@ -167,7 +169,7 @@ def ellipse(width: float, height: float, count: int = 20) -> Array:
     return np.stack([width * np.cos(angle), height * np.sin(angle)], axis=1)
 
 
-Rest = Callable[[Array, Array], Array]
+ChartToPoints = Callable[[Array, Array], Array]
 HARD_ANGLE = 40.0
 """Degrees; where two parts of a profile meet at more, the edge stays hard."""
 
@@ -191,12 +193,12 @@ class Patch:
     vertices: Array
     normals: Array
     uvs: Array
-    faces: assets.Ints
+    faces: assets.IntArray
     size: tuple[float, float]
-    rest: Rest
+    rest: ChartToPoints
 
 
-def placed(
+def transform_patches(
     patches: Iterable[Patch],
     rotation: Array | None = None,
     offset: Sequence[float] = (0.0, 0.0, 0.0),
@@ -214,14 +216,16 @@ def placed(
     ]
 
 
-def stretched(
+def stretch_patches(
     patches: Iterable[Patch], factors: Sequence[float] | Array
 ) -> list[Patch]:
     """Scale patches along x, y and z, with what is painted on them."""
     scale = np.asarray(factors, dtype=np.float64)
     return [
         replace(
-            patch, vertices=patch.vertices * scale, normals=unit(patch.normals / scale)
+            patch,
+            vertices=patch.vertices * scale,
+            normals=normalize(patch.normals / scale),
         )
         for patch in patches
     ]
@@ -257,7 +261,9 @@ def grid(
         .reshape(-1, 3)
         .astype(np.int64)
     )
-    area = np.linalg.norm(assets.face_vectors(points.reshape(-1, 3)[faces]), axis=1)
+    area = np.linalg.norm(
+        assets.compute_area_vectors(points.reshape(-1, 3)[faces]), axis=1
+    )
     # none where a row shrinks to a point
     faces = faces[area > 1e-6 * float(np.median(area[area > 0.0]))]
     interpolate = RegularGridInterpolator(
@@ -275,11 +281,11 @@ def grid(
 
 def _along(curve: Array) -> tuple[Array, float]:
     """Return the normalized arc lengths (K,) of a polyline, and its length."""
-    arc_length = lengths(curve)
+    arc_length = arc_lengths(curve)
     return arc_length / arc_length[-1], float(arc_length[-1])
 
 
-def _fan(count: int) -> assets.Ints:
+def _fan(count: int) -> assets.IntArray:
     """Return the faces (count, 3) between vertex 0 and a ring of `count` vertices after it."""
     j = np.arange(count)
     return np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % count], axis=1).astype(
@@ -299,13 +305,13 @@ def _profile_normals(parts: Sequence[Array]) -> list[Array]:
         for end, row in ((0, 0), (-1, -1)):
             if polyline[end, 0] < 1e-9:
                 direction[row] = (step[row][0], 0.0)
-        directions.append(unit(direction))
+        directions.append(normalize(direction))
     for before, after, p, q in zip(
         directions, directions[1:], parts, parts[1:], strict=False
     ):
         is_joined = float(np.linalg.norm(p[-1] - q[0])) < 1e-9
         if is_joined and float(before[-1] @ after[0]) > np.cos(np.radians(HARD_ANGLE)):
-            before[-1] = after[0] = unit(before[-1] + after[0])
+            before[-1] = after[0] = normalize(before[-1] + after[0])
     return [np.stack([d[:, 1], -d[:, 0]], axis=1) for d in directions]
 
 
@@ -472,7 +478,7 @@ def vessel(
         + np.sin(lip_angle)[:, None] * lip_up
     )
     fillet = min(1.5 * wall, 0.3 * float(outside[:, 0].max()))
-    floor_radius = at_height(inner[::-1], floor)
+    floor_radius = radius_at_height(inner[::-1], floor)
     inner = inner[
         (inner[:, 1] > floor + fillet)
         & (inner[:, 0] > 0.05 * float(outside[:, 0].max()))
@@ -492,14 +498,14 @@ def vessel(
     pieces = [
         (
             "base",
-            dense(
+            subdivide(
                 [(0.0, inset), (0.86 * foot[0], inset), (0.9 * foot[0], foot[1]), foot],
                 3 * step,
             ),
         ),
-        ("outside", dense(np.concatenate([outside, lip, inner[:1]]), step)),
-        ("inside", dense(inside, step)),
-        ("inside", dense([fillet_end, (0.0, floor)], 3 * step)),
+        ("outside", subdivide(np.concatenate([outside, lip, inner[:1]]), step)),
+        ("inside", subdivide(inside, step)),
+        ("inside", subdivide([fillet_end, (0.0, floor)], 3 * step)),
     ]
     return lathe(pieces, columns)
 
@@ -521,10 +527,10 @@ def sphere(
         (tag, curve[cut : rows - cut + 1]),
         (tag, curve[rows - cut :]),
     ]
-    return placed(lathe(pieces, columns), offset=centre)
+    return transform_patches(lathe(pieces, columns), offset=centre)
 
 
-def frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
+def compute_frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
     """Return unit tangents and two normals along a path, with as little twist as possible.
 
     Args:
@@ -534,11 +540,11 @@ def frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
     Returns:
         Three arrays (N, 3).
     """
-    tangent = unit(np.gradient(path, axis=0))
+    tangent = normalize(np.gradient(path, axis=0))
     normal = np.empty_like(path)
     current = np.asarray(first, dtype=np.float64)
     for i, direction in enumerate(tangent):
-        current = unit(current - (current @ direction) * direction)
+        current = normalize(current - (current @ direction) * direction)
         normal[i] = current
     return tangent, normal, np.cross(tangent, normal)
 
@@ -562,11 +568,11 @@ def sweep(
             the surface in a point.
         first: where the section's first axis points at the start.
         caps: close both ends with flat faces and a hard edge.
-        frame: tangents and normals to use in place of `frames(path, first)`.
+        frame: tangents and normals to use in place of `compute_frames(path, first)`.
     """
     centres = np.asarray(path, dtype=np.float64)
     tangent, first_normal, second_normal = (
-        frames(centres, first) if frame is None else frame
+        compute_frames(centres, first) if frame is None else frame
     )
     scales = np.asarray(scale, dtype=np.float64)
     scales = np.broadcast_to(
@@ -583,7 +589,7 @@ def sweep(
         np.gradient(points, axis=0),
     )
     normal_length = np.linalg.norm(normals, axis=-1)
-    normals = unit(normals)
+    normals = normalize(normals)
     for row, direction in ((0, -1.0), (-1, 1.0)):  # where a row is a point
         normals[row][normal_length[row] < 1e-7 * float(normal_length.max())] = (
             direction * tangent[row]
@@ -623,8 +629,8 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
     The ring is counter-clockwise seen from outside; `normal` is the unit normal.
     """
     centre = ring.mean(axis=0)
-    x = unit(ring[0] - centre)
-    x = unit(x - (x @ normal) * normal)
+    x = normalize(ring[0] - centre)
+    x = normalize(x - (x @ normal) * normal)
     y = np.cross(normal, x)
     plane_points = np.stack([(ring - centre) @ x, (ring - centre) @ y], axis=1)
     lower = plane_points.min(axis=0)
@@ -691,7 +697,7 @@ def box(
             cube[..., axis] = half[axis]
             cube[..., i], cube[..., j] = u[None], v[:, None]
             inner = np.clip(cube, -core, core)
-            normal = unit(cube - inner)
+            normal = normalize(cube - inner)
             points = inner + bevel * normal
             if side < 0:  # half a turn about the j axis: keeps orientation
                 points = points[:, ::-1].copy()
@@ -734,7 +740,9 @@ That avoids slivers.
 """
 
 
-def carved(patches: Iterable[Patch], inside: Field, tag: str | None) -> list[Patch]:
+def carve_patches(
+    patches: Iterable[Patch], inside: Field, tag: str | None
+) -> list[Patch]:
     """Cut patches along the surface of a field, and give the inside another tag.
 
     Args:
@@ -761,11 +769,13 @@ def carved(patches: Iterable[Patch], inside: Field, tag: str | None) -> list[Pat
             (cut.faces[is_inside], tag),
         ):
             if len(faces) and part_tag is not None:
-                carved_patches.append(cropped(replace(cut, faces=faces, tag=part_tag)))
+                carved_patches.append(
+                    crop_chart(replace(cut, faces=faces, tag=part_tag))
+                )
     return carved_patches
 
 
-def cropped(patch: Patch) -> Patch:
+def crop_chart(patch: Patch) -> Patch:
     """Return the patch with a chart that is cropped to what its faces use."""
     used_uvs = patch.uvs[np.unique(patch.faces)]
     lower = used_uvs.min(axis=0)
@@ -782,7 +792,7 @@ def cropped(patch: Patch) -> Patch:
     )
 
 
-def _edges(patch: Patch) -> assets.Ints:
+def _edges(patch: Patch) -> assets.IntArray:
     """Return the unique edges (E, 2) of a patch as sorted vertex indices."""
     pairs = np.concatenate(
         [patch.faces[:, [0, 1]], patch.faces[:, [1, 2]], patch.faces[:, [2, 0]]]
@@ -790,7 +800,7 @@ def _edges(patch: Patch) -> assets.Ints:
     return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64))
 
 
-def _split(patch: Patch, value: Array) -> tuple[Patch, assets.Bools]:
+def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
     """Split the triangles of a patch where the values (V,) of its vertices change sign.
 
     Returns:
@@ -838,7 +848,7 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.Bools]:
 
 
 def _outline_with_cuts(
-    face: assets.Ints, value: Array, cut_of_edge: Mapping[tuple[int, int], int]
+    face: assets.IntArray, value: Array, cut_of_edge: Mapping[tuple[int, int], int]
 ) -> list[tuple[int, float]]:
     """Return the vertices of a triangle with the cuts of its edges between them.
 

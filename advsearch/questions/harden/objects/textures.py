@@ -26,13 +26,13 @@ T = TypeVar("T")
 Color = Array  # (3,) display-referred sRGB
 
 
-def hexed(code: str) -> Color:
+def parse_hex_color(code: str) -> Color:
     """Return the color that six hexadecimal digits stand for."""
     return np.array([int(code[i : i + 2], 16) / 255.0 for i in (0, 2, 4)])
 
 
 @dataclass(frozen=True)
-class Draw:
+class ParameterSampler:
     """Samples the parameters of an instance, or returns the canonical ones."""
 
     # the source of randomness, or None for the canonical instance
@@ -63,21 +63,21 @@ class Draw:
             else self.rng.uniform(0.0, 16.0, 3)
         )
 
-    def colour(self, canonical: str, *others: str, wild: float = 0.4) -> Color:
+    def sample_color(self, canonical: str, *others: str, wild: float = 0.4) -> Color:
         """Return a color near one of those named, or with probability `wild` any color.
 
         Without a generator it is the canonical one.
         """
         rng = self.rng
         if rng is None:
-            return hexed(canonical)
+            return parse_hex_color(canonical)
         if rng.random() < wild:
             return np.array(
                 colorsys.hsv_to_rgb(
                     rng.random(), rng.random() ** 0.7, rng.uniform(0.15, 0.97)
                 )
             )
-        base = hexed(self.pick(canonical, *others))
+        base = parse_hex_color(self.pick(canonical, *others))
         return np.clip(
             base * rng.uniform(0.85, 1.12) + rng.uniform(-0.05, 0.05, 3), 0.02, 0.98
         )
@@ -145,7 +145,7 @@ def mix(a: Array, b: Array, weight: Array) -> Array:
     return a + (b - a) * weight[:, None]
 
 
-def within(value: Array, low: float, high: float, soft: float) -> Array:
+def band_mask(value: Array, low: float, high: float, soft: float) -> Array:
     """Return 1 between two values and 0 outside, with ramps `soft` wide."""
     return step(value, low, soft) * step(-value, -high, soft)
 
@@ -159,7 +159,7 @@ def step(value: Array, edge: float, soft: float) -> Array:
 def solid(t: Texels, color: Color | str) -> Array:
     """Paint a single color."""
     return np.broadcast_to(
-        hexed(color) if isinstance(color, str) else color, (len(t.u), 3)
+        parse_hex_color(color) if isinstance(color, str) else color, (len(t.u), 3)
     )
 
 
@@ -296,7 +296,7 @@ def between(
     t: Texels, low: float, high: float, axis: int = 2, soft: float = 0.02
 ) -> Array:
     """Return the mask of texels between two values of a coordinate, with edges `soft` wide."""
-    return within(t.xyz[:, axis], low, high, soft)
+    return band_mask(t.xyz[:, axis], low, high, soft)
 
 
 @painter
@@ -312,7 +312,7 @@ def facing(
 
     It is within `half_width` degrees of the azimuth `degrees` about z.
     """
-    weight = within(t.xyz[:, 2], low, high, soft)
+    weight = band_mask(t.xyz[:, 2], low, high, soft)
     in_band = np.nonzero(weight)[0]
     angle = np.degrees(np.arctan2(t.xyz[in_band, 1], t.xyz[in_band, 0]))
     angle_distance = np.abs((angle - degrees + 180.0) % 360.0 - 180.0)
@@ -320,15 +320,15 @@ def facing(
     return weight
 
 
-def anything(draw: Draw, size: float) -> Paint:
+def sample_paint(draw: ParameterSampler, size: float) -> Paint:
     """Sample a paint of any kind and colors, for textures that do not indicate the class.
 
     Args:
         draw: with a generator.
         size: of the instance, about.
     """
-    first_color = draw.colour("808080", wild=1.0)
-    second_color = draw.colour("808080", wild=1.0)
+    first_color = draw.sample_color("808080", wild=1.0)
+    second_color = draw.sample_color("808080", wild=1.0)
     cell = size * draw(0.1, 0.05, 0.2)
     noise_offset = draw.offset()
     kind = draw.pick(
@@ -383,7 +383,7 @@ def anything(draw: Draw, size: float) -> Paint:
         )
     if kind == "wood":
         return wood(
-            draw.colour("9a6a3c", "c89b62", "5b3a22"),
+            draw.sample_color("9a6a3c", "c89b62", "5b3a22"),
             0.5 * cell,
             noise_offset,
             axis=int(draw.pick(0, 1, 2)),
@@ -391,9 +391,11 @@ def anything(draw: Draw, size: float) -> Paint:
     return solid(first_color)
 
 
-def natural(draw: Draw, size: float, paint: Paint, wild: float = 0.35) -> Paint:
-    """Return the paint, or with probability `wild` a sample of `anything`.
+def paint_or_random(
+    draw: ParameterSampler, size: float, paint: Paint, wild: float = 0.35
+) -> Paint:
+    """Return the paint, or with probability `wild` a sample of `sample_paint`.
 
     The canonical instance has the paint.
     """
-    return anything(draw, size) if draw.chance(wild) else paint
+    return sample_paint(draw, size) if draw.chance(wild) else paint

@@ -10,20 +10,20 @@ import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
 from advsearch.extend import assets
-from advsearch.questions.harden.objects.family import Instance, family, finish
+from advsearch.questions.harden.objects.family import Instance, family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
-    Draw,
     Paint,
+    ParameterSampler,
     Texels,
-    anything,
     clouded,
-    hexed,
     mix,
-    natural,
     noise,
     over,
+    paint_or_random,
     painter,
+    parse_hex_color,
+    sample_paint,
     shade,
     solid,
     step,
@@ -31,7 +31,7 @@ from advsearch.questions.harden.objects.textures import (
 
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
 _SIGNS = ((a, b) for a in (-1.0, 1.0) for b in (-_GOLDEN, _GOLDEN))
-PENTAGONS = shapes.unit(
+PENTAGONS = shapes.normalize(
     np.array(
         [
             corner
@@ -49,7 +49,9 @@ _FACES = [
     for face in combinations(range(12), 3)
     if all(_NEAR[pair] for pair in combinations(face, 2))
 ]
-HEXAGONS = shapes.unit(np.array([PENTAGONS[list(face)].sum(axis=0) for face in _FACES]))
+HEXAGONS = shapes.normalize(
+    np.array([PENTAGONS[list(face)].sum(axis=0) for face in _FACES])
+)
 """The 20 unit directions of its face middles: the middles of the light panels."""
 
 
@@ -105,12 +107,12 @@ def _grooved(
 
 @painter
 def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
-    seam_distance, pentagon = football_seams(shapes.unit(t.xyz))
+    seam_distance, pentagon = football_seams(shapes.normalize(t.xyz))
     base = (
         mix(light, dark, pentagon.astype(np.float64))
         * (1.0 - 0.06 * noise(t.xyz / 2.0 + offset))[:, None]
     )
-    return mix(hexed("3a3a3a"), base, step(seam_distance, 0.012, 0.016))
+    return mix(parse_hex_color("3a3a3a"), base, step(seam_distance, 0.012, 0.016))
 
 
 @painter
@@ -126,7 +128,7 @@ def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array
 
 @painter
 def _near_to(t: Texels, seam: Callable[[Array], Array], reach: float) -> Array:
-    return step(-seam(shapes.unit(t.xyz)), -reach, 0.02)
+    return step(-seam(shapes.normalize(t.xyz)), -reach, 0.02)
 
 
 @painter
@@ -139,7 +141,7 @@ def _star(t: Texels, radius: float) -> Array:
 
 
 @family(metres=0.01)
-def ball(draw: Draw) -> Instance:
+def ball(draw: ParameterSampler) -> Instance:
     """Make a football, or a ball of another pattern."""
     radius = 11.0
     style = draw.pick(
@@ -151,18 +153,18 @@ def ball(draw: Draw) -> Instance:
         "x", draw(24.0, 0.0, 180.0)
     )
     offset = draw.offset()
-    light = draw.colour("f1f0ea", "f4f4f2", "e8d34a", wild=0.3)
-    dark = draw.colour("1d1f22", "23395d", "b5442e", wild=0.3)
+    light = draw.sample_color("f1f0ea", "f4f4f2", "e8d34a", wild=0.3)
+    dark = draw.sample_color("1d1f22", "23395d", "b5442e", wild=0.3)
     if style == "beach":
         bright = [
-            draw.colour(code, wild=0.5)
+            draw.sample_color(code, wild=0.5)
             for code in "d8342c f4f4f2 2f6fb5 f4f4f2 eeb52d f4f4f2".split()
         ]
         paint = _beach(
             [color if draw.chance(0.7) else light for color in bright], light, radius
         )
     elif style == "basket":
-        skin = draw.colour("c8642b", "b5532a", "7a3b22", wild=0.2)
+        skin = draw.sample_color("c8642b", "b5532a", "7a3b22", wild=0.2)
         paint = over(
             clouded(skin, 0.85, 0.7, offset),
             _near_to(basketball_seams, 0.03),
@@ -170,7 +172,7 @@ def ball(draw: Draw) -> Instance:
         )
         patches = _grooved(patches, radius, 0.015, basketball_seams)
     elif style == "tennis":
-        felt = draw.colour("c9d63c", "d5dc4a", "e08a2e", wild=0.25)
+        felt = draw.sample_color("c9d63c", "d5dc4a", "e08a2e", wild=0.25)
         paint = over(
             clouded(felt, 0.85, 0.6, offset),
             _near_to(tennis_seam, 0.045),
@@ -181,21 +183,24 @@ def ball(draw: Draw) -> Instance:
     elif style == "plain":
         paint = clouded(dark, 1.2, 3.0, offset)
     elif style == "wild":
-        paint = anything(draw, 2 * radius)
+        paint = sample_paint(draw, 2 * radius)
     else:
         paint = _football(light, dark, offset)
         patches = _grooved(
-            patches, radius, 0.008, lambda d: football_seams(shapes.unit(d))[0] * 1.5
+            patches,
+            radius,
+            0.008,
+            lambda d: football_seams(shapes.normalize(d))[0] * 1.5,
         )
     shaped = [
         replace(p, vertices=p.vertices * np.array([1.0, 1.0, squash]))
-        for p in shapes.placed(patches, turn)
+        for p in shapes.transform_patches(patches, turn)
     ]
-    return Instance(shaped, {"ball": paint}, finish(draw, 0.4, 0.3))
+    return Instance(shaped, {"ball": paint}, sample_material(draw, 0.4, 0.3))
 
 
 @family(metres=0.01)
-def banana(draw: Draw) -> Instance:
+def banana(draw: ParameterSampler) -> Instance:
     """Make a banana of random bend and ripeness."""
     length = draw(19.0, 15.0, 22.0)
     bend = draw(105.0, 65.0, 130.0)
@@ -222,12 +227,16 @@ def banana(draw: Draw) -> Instance:
     patches = shapes.sweep(
         "banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True
     )
-    patches = shapes.placed(patches, shapes.rotation("y", draw(9.0, 0.0, 14.0)))
-    patches = shapes.placed(patches, shapes.rotation("z", draw(78.0, 45.0, 120.0)))
+    patches = shapes.transform_patches(
+        patches, shapes.rotation("y", draw(9.0, 0.0, 14.0))
+    )
+    patches = shapes.transform_patches(
+        patches, shapes.rotation("z", draw(78.0, 45.0, 120.0))
+    )
 
     offset = draw.offset()
-    skin = draw.colour("f0c930", "f3d64a", "e3b62a", "b7c04a", wild=0.0)
-    tip, brown, green = map(hexed, ("3a2a18", "6b4520", "a9b13c"))
+    skin = draw.sample_color("f0c930", "f3d64a", "e3b62a", "b7c04a", wild=0.0)
+    tip, brown, green = map(parse_hex_color, ("3a2a18", "6b4520", "a9b13c"))
     amount = draw(0.1, 0.0, 0.22)
     heads = path[[0, -1]]
 
@@ -249,12 +258,14 @@ def banana(draw: Draw) -> Instance:
         return mix(base, tip, step(-end, -0.75, 0.5))
 
     return Instance(
-        patches, {"banana": natural(draw, length, paint, 0.4)}, finish(draw, 0.45, 0.1)
+        patches,
+        {"banana": paint_or_random(draw, length, paint, 0.4)},
+        sample_material(draw, 0.45, 0.1),
     )
 
 
 @family(metres=0.01)
-def book(draw: Draw) -> Instance:
+def book(draw: ParameterSampler) -> Instance:
     """Make a closed hardback that lies on its back cover.
 
     The spine runs along y at -x; the pages show at the other three sides.
@@ -282,17 +293,23 @@ def book(draw: Draw) -> Instance:
         axis=1,
     )[::-1]
     patches += _spine(outer, inner, height)
-    turned = shapes.placed(patches, shapes.rotation("z", draw(-122.0, -150.0, -100.0)))
+    turned = shapes.transform_patches(
+        patches, shapes.rotation("z", draw(-122.0, -150.0, -100.0))
+    )
 
     offset = draw.offset()
-    cloth = draw.colour(
+    cloth = draw.sample_color(
         "7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd"
     )
-    gold = draw.colour("d8b45a", "efe6cf", "1d1f22", wild=0.25)
-    base = natural(draw, height, clouded(cloth, 0.85, 0.6, offset, 1.2), 0.3)
+    gold = draw.sample_color("d8b45a", "efe6cf", "1d1f22", wild=0.25)
+    base = paint_or_random(draw, height, clouded(cloth, 0.85, 0.6, offset, 1.2), 0.3)
     title = draw.pick("frame", "blocks", "picture", "plain")
     front = _front(draw, base, gold, title, width, height, thick)
-    paper = hexed("ece2c8") if draw.chance(0.7, True) else hexed("f4f2ea")
+    paper = (
+        parse_hex_color("ece2c8")
+        if draw.chance(0.7, True)
+        else parse_hex_color("f4f2ea")
+    )
 
     def pages_paint(t: Texels) -> Array:
         lines = noise(
@@ -324,7 +341,7 @@ def book(draw: Draw) -> Instance:
     return Instance(
         turned,
         {"cover": front, "pages": pages_paint, "spine": spine},
-        finish(draw, 0.55, 0.0),
+        sample_material(draw, 0.55, 0.0),
     )
 
 
@@ -367,7 +384,7 @@ def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
 
 
 def _front(
-    draw: Draw,
+    draw: ParameterSampler,
     base: Paint,
     gold: Array,
     title: str,
@@ -376,7 +393,7 @@ def _front(
     thick: float,
 ) -> Paint:
     """Paint the front cover with a title and decoration."""
-    accent = draw.colour("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
+    accent = draw.sample_color("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
 
     def inside(x: Array, y: Array, w: float, h: float) -> Array:
         return step(w - np.abs(x), 0.0, 0.12) * step(h - np.abs(y), 0.0, 0.12)
@@ -497,16 +514,16 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
         for k, letter in enumerate(letters)
         for path in _STROKES[letter]
     ]
-    word = step(0.05 * inner - shapes.away_from(y, z, *strokes), 0.0, 0.006)
-    return mix(red, hexed("f3f2ee"), np.maximum(rim, word))
+    word = step(0.05 * inner - shapes.distance_to_polylines(y, z, *strokes), 0.0, 0.006)
+    return mix(red, parse_hex_color("f3f2ee"), np.maximum(rim, word))
 
 
 @family(metres=1.0, texels=192)
-def stop_sign(draw: Draw) -> Instance:
+def stop_sign(draw: ParameterSampler) -> Instance:
     """Make a stop sign on a post."""
     radius = draw(0.45, 0.4, 0.5)
     height = draw(0.74, 0.66, 0.84)
-    red = draw.colour("b3121d", "a8161f", "c0202a", wild=0.0)
+    red = draw.sample_color("b3121d", "a8161f", "c0202a", wild=0.0)
     ring = shapes.polygon(8, 0.02, 2) * radius
     ahead = np.array([1.0, 0.0, 0.0])
     # an octagon that looks along +x, its middle at the origin
@@ -519,8 +536,8 @@ def stop_sign(draw: Draw) -> Instance:
         *edge,
         shapes.cap("metal", back[::-1], -ahead),
     ]
-    plate = shapes.placed(plate, offset=(0.036, 0.0, height))
-    tube = shapes.rounded(
+    plate = shapes.transform_patches(plate, offset=(0.036, 0.0, height))
+    tube = shapes.round_corners(
         [
             (0.03, 0.0),
             (0.03, height + 0.7 * radius),
@@ -541,14 +558,14 @@ def stop_sign(draw: Draw) -> Instance:
         for z in heights
         for patch in shapes.box("post", (0.008, 0.0, z), (0.05, 0.09, 0.03), 0.006, 1)
     ]
-    grey = draw.colour("9a9da0", "7d8083", wild=0.0)
+    grey = draw.sample_color("9a9da0", "7d8083", wild=0.0)
     paints = {
         "face": _face(red, radius),
         "metal": solid("a4a7aa"),
         "post": solid(grey),
         "rubber": solid("1d1d1f"),
     }
-    turned = shapes.placed(
+    turned = shapes.transform_patches(
         [*plate, *post, *foot, *clamps], shapes.rotation("z", draw(0.0, -25.0, 25.0))
     )
     return Instance(

@@ -5,27 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
-from advsearch.questions.harden.objects.family import Instance, family, finish
+from advsearch.questions.harden.objects.family import Instance, family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
-    Draw,
+    ParameterSampler,
     Texels,
+    band_mask,
     between,
     clouded,
-    natural,
     over,
+    paint_or_random,
     rings,
     shade,
     solid,
     speckled,
     step,
-    within,
     wood,
 )
 
 
 def _claw(
-    draw: Draw, half: float, start: float, length: float, drop: float
+    draw: ParameterSampler, half: float, start: float, length: float, drop: float
 ) -> list[Patch]:
     """Two tapering prongs that curve downwards (towards -x) from the head, along +y."""
     spread = draw(0.34, 0.2, 0.5)
@@ -50,7 +50,9 @@ def _along_y(*positions: float) -> Array:
     return np.array([(0.0, y, 0.0) for y in positions])
 
 
-def _peen(draw: Draw, half: float, start: float, length: float) -> list[Patch]:
+def _peen(
+    draw: ParameterSampler, half: float, start: float, length: float
+) -> list[Patch]:
     """A wedge (cross peen) or a ball at the back of the head, along +y."""
     if draw.chance(0.5):
         neck = _along_y(start - 0.3, start + 0.5 * length)
@@ -72,7 +74,7 @@ def _peen(draw: Draw, half: float, start: float, length: float) -> list[Patch]:
 
 
 @family(metres=0.01)
-def hammer(draw: Draw) -> Instance:
+def hammer(draw: ParameterSampler) -> Instance:
     """Make a hammer whose handle runs along -x, and whose head lies along y.
 
     The head is at the origin, and its striking face at -y.
@@ -160,25 +162,25 @@ def hammer(draw: Draw) -> Instance:
 
     top = max(half * 1.05, face if style != "sledge" else face * 1.2)
     tilt = np.degrees(np.arctan2(top - thick * (1.0 + belly), 0.8 * length))
-    patches = shapes.placed(
-        shapes.placed([*head, *stick], shapes.rotation("y", -float(tilt))),
+    patches = shapes.transform_patches(
+        shapes.transform_patches([*head, *stick], shapes.rotation("y", -float(tilt))),
         shapes.rotation("z", draw(58.0, 20.0, 90.0)),
     )
 
     offset = draw.offset()
-    steel = draw.colour("4b4f55", "8d9298", "2b2d30", "6b7078", wild=0.15)
+    steel = draw.sample_color("4b4f55", "8d9298", "2b2d30", "6b7078", wild=0.15)
     metal = over(
         clouded(steel, 0.8, 1.6, offset, 2.4),
         lambda t: step(-t.xyz[:, 1], 0.86 * front, 0.3),
         solid(shade(steel, 1.7)),
     )
     timber = wood(
-        draw.colour("c48f55", "a8743f", "d9b27c", "7a4f2a", wild=0.05),
+        draw.sample_color("c48f55", "a8743f", "d9b27c", "7a4f2a", wild=0.05),
         0.9,
         offset,
         axis=0,
     )
-    stain = draw.colour("8f2e22", "1f4e79", "d9a02b", "2d2d33", "3d6b4a")
+    stain = draw.sample_color("8f2e22", "1f4e79", "d9a02b", "2d2d33", "3d6b4a")
     kind = draw.pick("wood", "dipped", "rubber")
     hold = timber
     if kind == "dipped":
@@ -195,14 +197,14 @@ def hammer(draw: Draw) -> Instance:
             ribs,
         )
     paints = {
-        "head": natural(draw, length, metal, 0.3),
-        "handle": natural(draw, length, hold, 0.3),
+        "head": paint_or_random(draw, length, metal, 0.3),
+        "handle": paint_or_random(draw, length, hold, 0.3),
     }
-    return Instance(patches, paints, finish(draw, 0.38, 0.2))
+    return Instance(patches, paints, sample_material(draw, 0.38, 0.2))
 
 
 def _weights(
-    draw: Draw, style: str, at: float, length: float, radius: float
+    draw: ParameterSampler, style: str, at: float, length: float, radius: float
 ) -> list[Patch]:
     """Create the weight on the +x end of the bar, built along z and rotated afterwards."""
     if style == "hex":
@@ -230,7 +232,7 @@ def _weights(
         thick = length / plates * 0.94
         size = radius * (1.0 - 0.17 * i)
         bevel = min(0.25 * thick, 0.6)
-        side = shapes.rounded(
+        side = shapes.round_corners(
             [(0.55 * size, z), (size, z), (size, z + thick), (0.55 * size, z + thick)],
             bevel,
             4,
@@ -238,7 +240,11 @@ def _weights(
         under = [(0.0, z), (0.55 * size, z)]
         top = [(0.55 * size, z + thick), (0.0, z + thick)]
         patches += shapes.lathe(
-            [("weight", under), ("weight", shapes.dense(side, 1.2)), ("weight", top)],
+            [
+                ("weight", under),
+                ("weight", shapes.subdivide(side, 1.2)),
+                ("weight", top),
+            ],
             44,
         )
         z += length / plates
@@ -255,7 +261,7 @@ def _weights(
 
 
 @family(metres=0.01)
-def dumbbell(draw: Draw) -> Instance:
+def dumbbell(draw: ParameterSampler) -> Instance:
     """Make a dumbbell with weights of random shape."""
     style = draw.pick("hex", "plates", "hex", "round", "globe")
     radius = draw(4.6, 3.6, 6.2)
@@ -271,14 +277,14 @@ def dumbbell(draw: Draw) -> Instance:
     patches = (
         shapes.lathe([("bar", profile)], 28)
         + weights
-        + shapes.placed(weights, shapes.rotation("y", 180.0))
+        + shapes.transform_patches(weights, shapes.rotation("y", 180.0))
     )
-    laid = shapes.placed(
-        shapes.placed(patches, shapes.rotation("y", 90.0)),
+    laid = shapes.transform_patches(
+        shapes.transform_patches(patches, shapes.rotation("y", 90.0)),
         shapes.rotation("z", draw(118.0, 90.0, 150.0)),
     )
     offset = draw.offset()
-    iron = draw.colour(
+    iron = draw.sample_color(
         "26282b", "3a3d42", "8a8d92", "7a2f8f", "2f6f8f", "c23b4a", wild=0.25
     )
     weight = speckled(
@@ -289,17 +295,17 @@ def dumbbell(draw: Draw) -> Instance:
         draw(0.08, 0.0, 0.2),
     )
     tip = grip + (length if style != "globe" else 1.75 * radius)
-    accent = draw.colour("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
+    accent = draw.sample_color("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
     if draw.chance(0.5, True):
 
         def on_both_ends(t: Texels) -> Array:
-            ring = within(
+            ring = band_mask(
                 np.hypot(t.xyz[:, 0], t.xyz[:, 1]), 0.34 * radius, 0.44 * radius, 0.12
             )
             return step(np.abs(t.xyz[:, 2]), tip - 0.6, 0.05) * ring
 
         weight = over(weight, on_both_ends, solid(accent))
-    steel = draw.colour("b4b8bd", "8d9298", "2b2d30", wild=0.2)
+    steel = draw.sample_color("b4b8bd", "8d9298", "2b2d30", wild=0.2)
     knurl = over(
         solid(steel),
         lambda t: (
@@ -311,5 +317,5 @@ def dumbbell(draw: Draw) -> Instance:
         ),
         solid(shade(steel, 0.55)),
     )
-    paints = {"weight": natural(draw, 2 * tip, weight, 0.35), "bar": knurl}
-    return Instance(laid, paints, finish(draw, 0.42, 0.2))
+    paints = {"weight": paint_or_random(draw, 2 * tip, weight, 0.35), "bar": knurl}
+    return Instance(laid, paints, sample_material(draw, 0.42, 0.2))

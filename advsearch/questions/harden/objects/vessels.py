@@ -5,24 +5,24 @@ from __future__ import annotations
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
-from advsearch.questions.harden.objects.family import Instance, family, finish
+from advsearch.questions.harden.objects.family import Instance, family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
-    Draw,
     Paint,
+    ParameterSampler,
     Texels,
-    anything,
     between,
     checks,
     clouded,
     dots,
     facing,
     gradient,
-    hexed,
     mottled,
-    natural,
     over,
+    paint_or_random,
+    parse_hex_color,
     rings,
+    sample_paint,
     shade,
     solid,
     speckled,
@@ -32,11 +32,11 @@ from advsearch.questions.harden.objects.textures import (
 )
 
 # turns the seam of a lathe away from the default camera, at azimuth 40
-BACK = shapes.rotation("z", 220.0)
+SEAM_ROTATION = shapes.rotation("z", 220.0)
 
 
-def handle(
-    draw: Draw,
+def make_handle(
+    draw: ParameterSampler,
     style: str,
     low: float,
     high: float,
@@ -54,7 +54,7 @@ def handle(
         profile: of the wall (K, 2).
         inset: depth of the roots inside the wall.
     """
-    at_low, at_high = (shapes.at_height(profile, z) - inset for z in (low, high))
+    at_low, at_high = (shapes.radius_at_height(profile, z) - inset for z in (low, high))
     edge = max(at_low, at_high)
     if style == "square":
         corners = [
@@ -64,7 +64,7 @@ def handle(
             (at_low, low),
         ]
         curve = shapes.spline(
-            shapes.dense(shapes.rounded(corners, 0.45 * reach, 6), 0.8), 26
+            shapes.subdivide(shapes.round_corners(corners, 0.45 * reach, 6), 0.8), 26
         )
     else:
         tops = {
@@ -89,15 +89,19 @@ def handle(
     section = shapes.ellipse(thick, broad, 16)
     if not draw.chance(0.7, True):
         section = shapes.rectangle(2 * thick, 2 * broad, 0.6 * thick)
-    return shapes.sweep("handle", shapes.upright(curve), section, flare)
+    return shapes.sweep("handle", shapes.to_xz_plane(curve), section, flare)
 
 
-def _ceramic(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
+def _ceramic(
+    draw: ParameterSampler, height: float, glaze: Paint, accent: Paint
+) -> Paint:
     """Decorations a potter or a printer might put around a vessel of that height."""
     kind = draw.pick(
         "band", "plain", "bands", "dots", "stripes", "dip", "checks", "zigzag", "rings"
     )
-    second = draw.colour("2f5d7c", "b5442e", "356b4f", "e0b040", "22262b", "f2efe6")
+    second = draw.sample_color(
+        "2f5d7c", "b5442e", "356b4f", "e0b040", "22262b", "f2efe6"
+    )
     pale = "f4efe4"
     if kind == "band":
         return over(
@@ -111,12 +115,12 @@ def _ceramic(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
         return over(
             glaze,
             between(0.62 * height, 0.9 * height),
-            rings(hexed(pale), second, 0.13 * height),
+            rings(parse_hex_color(pale), second, 0.13 * height),
         )
     if kind == "dots":
         return dots(glaze, second, draw(2.0, 1.2, 3.2), draw(0.3, 0.2, 0.4))
     if kind == "stripes":
-        ground = draw.colour(pale, "f4f4f2")
+        ground = draw.sample_color(pale, "f4f4f2")
         return stripes(
             ground,
             second,
@@ -125,13 +129,13 @@ def _ceramic(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
             int(draw.pick(0, 2)),
         )
     if kind == "checks":
-        board = checks(draw.colour(pale), second, draw(1.4, 0.9, 2.2))
+        board = checks(draw.sample_color(pale), second, draw(1.4, 0.9, 2.2))
         return over(glaze, between(0.25 * height, 0.75 * height), board)
     if kind == "zigzag":
         return over(
             glaze,
             between(0.3 * height, 0.7 * height),
-            zigzag(draw.colour(pale), second, 2.5),
+            zigzag(draw.sample_color(pale), second, 2.5),
         )
     if kind == "dip":
         return over(
@@ -139,7 +143,7 @@ def _ceramic(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
         )
     if kind == "rings":
         return rings(
-            draw.colour(pale),
+            draw.sample_color(pale),
             second,
             height * draw(0.12, 0.06, 0.25),
             draw(0.5, 0.2, 0.7),
@@ -148,7 +152,7 @@ def _ceramic(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
 
 
 @family(metres=0.01)
-def mug(draw: Draw) -> Instance:
+def mug(draw: ParameterSampler) -> Instance:
     """Make a mug with a handle."""
     height = draw(9.4, 7.6, 12.0)
     top = draw(4.15, 3.6, 5.0)
@@ -172,37 +176,38 @@ def mug(draw: Draw) -> Instance:
         grip_low = height * draw(0.3, 0.34, 0.42)
     else:
         grip_low = height * draw(0.2, 0.16, 0.3)
-    grip = handle(
+    grip = make_handle(
         draw, style, grip_low, grip_high, draw(2.9, 2.3, 3.4), side, 0.55 * wall
     )
 
     paints = _mug_paints(draw, height)
-    patches = shapes.placed(
-        [*body, *shapes.placed(grip, shapes.rotation("z", -108.0))], BACK
+    patches = shapes.transform_patches(
+        [*body, *shapes.transform_patches(grip, shapes.rotation("z", -108.0))],
+        SEAM_ROTATION,
     )
     return Instance(
-        patches, paints, finish(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6}
+        patches, paints, sample_material(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6}
     )
 
 
-def _mug_paints(draw: Draw, height: float) -> dict[str, Paint]:
+def _mug_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
     """Sample the paints of a mug."""
     offset = draw.offset()
-    clay = draw.colour(
+    clay = draw.sample_color(
         "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0"
     )
-    specks = draw.colour("7d6247", wild=0.2)
+    specks = draw.sample_color("7d6247", wild=0.2)
     glaze = speckled(
         clouded(clay, 0.93, 3.0, offset), specks, 0.28, offset, draw(0.06, 0.0, 0.14)
     )
-    deep = draw.colour("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
+    deep = draw.sample_color("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
     accent = clouded(deep, 1.35, 2.2, offset)
-    outer = natural(draw, height, _ceramic(draw, height, glaze, accent))
+    outer = paint_or_random(draw, height, _ceramic(draw, height, glaze, accent))
     inner = outer
     if not draw.chance(0.15):
         inner = glaze
         if draw.chance(0.5, True):
-            inner = solid(draw.colour("efe6d4", "f3f1ec", wild=0.3))
+            inner = solid(draw.sample_color("efe6d4", "f3f1ec", wild=0.3))
     raw_clay = solid("a98663")
     outside = outer
     if draw.chance(0.4, True):
@@ -216,7 +221,7 @@ def _mug_paints(draw: Draw, height: float) -> dict[str, Paint]:
 
 
 @family(metres=0.01)
-def bowl(draw: Draw) -> Instance:
+def bowl(draw: ParameterSampler) -> Instance:
     """Make a bowl."""
     radius = 8.0
     height = radius * draw(0.86, 0.6, 1.0)
@@ -238,30 +243,33 @@ def bowl(draw: Draw) -> Instance:
         step=0.9,
     )
     offset = draw.offset()
-    clay = draw.colour("3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f")
+    clay = draw.sample_color("3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f")
     glaze = clouded(clay, 0.72, 2.6, offset)
-    accent = mottled(hexed("e8dcc0"), hexed("d6c39a"), 2.0, offset)
+    accent = mottled(parse_hex_color("e8dcc0"), parse_hex_color("d6c39a"), 2.0, offset)
     raw = solid("9b7352")
     if draw.rng is None:
         rim = over(glaze, between(0.93 * height, 2 * height, soft=0.25), accent)
         outer = over(rim, between(-1.0, 0.55, soft=0.1), raw)
     else:
-        outer = natural(draw, 2 * radius, _ceramic(draw, height, glaze, accent))
+        outer = paint_or_random(draw, 2 * radius, _ceramic(draw, height, glaze, accent))
     inner = draw.pick(
         accent,
         glaze,
         outer,
-        solid(draw.colour("f3f1ec")),
+        solid(draw.sample_color("f3f1ec")),
         rings(clay, shade(clay, 1.3), height * 0.2),
     )
     paints = {"outside": outer, "inside": inner, "base": raw}
     return Instance(
-        shapes.placed(body, BACK), paints, finish(draw, 0.28, 0.5), {"base": 0.6}
+        shapes.transform_patches(body, SEAM_ROTATION),
+        paints,
+        sample_material(draw, 0.28, 0.5),
+        {"base": 0.6},
     )
 
 
 @family(metres=0.01)
-def bottle(draw: Draw) -> Instance:
+def bottle(draw: ParameterSampler) -> Instance:
     """Make a bottle with a cap and perhaps a label."""
     height = draw(30.0, 24.0, 32.0)
     radius = draw(3.75, 3.0, 4.8)
@@ -281,7 +289,9 @@ def bottle(draw: Draw) -> Instance:
         (neck * 1.03, shoulder + rise),
         (neck * 0.95, height - 1.6),
     ]
-    curve = shapes.rounded(corners, [0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], 7)
+    curve = shapes.round_corners(
+        corners, [0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], 7
+    )
     wide = neck * 0.95 + draw(0.28, 0.1, 0.4)
     ring = [
         (wide, height - 1.5),
@@ -290,23 +300,23 @@ def bottle(draw: Draw) -> Instance:
         (neck * 0.93, height),
     ]
     capped = draw.chance(0.4)
-    outside = np.concatenate([shapes.dense(curve, 1.6), ring])
+    outside = np.concatenate([shapes.subdivide(curve, 1.6), ring])
     patches = shapes.vessel(outside, draw(0.35, 0.3, 0.45), 0.8, step=1.6, columns=48)
     if capped:
         patches += _cap(draw, wide + 0.12, height)
     offset = draw.offset()
-    glass = draw.colour(
+    glass = draw.sample_color(
         "17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416"
     )
-    surface = natural(draw, height, clouded(glass, 1.25, 9.0, offset), 0.25)
-    paper = draw.colour("efe6cf", "f5f2ea", "20242a", "c9a24b", wild=0.3)
-    ink = draw.colour("7a1f2b", "23395d", "2e2a25", "b08d3c", wild=0.3)
+    surface = paint_or_random(draw, height, clouded(glass, 1.25, 9.0, offset), 0.25)
+    paper = draw.sample_color("efe6cf", "f5f2ea", "20242a", "c9a24b", wild=0.3)
+    ink = draw.sample_color("7a1f2b", "23395d", "2e2a25", "b08d3c", wild=0.3)
     low = 0.14 * height
     high = min(draw(0.44, 0.3, 0.5) * height, shoulder - 1.5)
     outer = (
         surface if draw.chance(0.2) else _labelled(draw, surface, paper, ink, low, high)
     )
-    foil = draw.colour("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
+    foil = draw.sample_color("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
     if draw.chance(0.5, True):
         outer = over(
             outer,
@@ -317,26 +327,28 @@ def bottle(draw: Draw) -> Instance:
         "outside": outer,
         "inside": solid(shade(glass, 0.6)),
         "base": solid(glass),
-        "cap": solid(draw.colour("c9a24b", "d0d0d0", "b5442e", "22262b")),
+        "cap": solid(draw.sample_color("c9a24b", "d0d0d0", "b5442e", "22262b")),
     }
     return Instance(
-        shapes.placed(patches, BACK),
+        shapes.transform_patches(patches, SEAM_ROTATION),
         paints,
-        finish(draw, 0.2, 0.6),
+        sample_material(draw, 0.2, 0.6),
         {"inside": 0.25, "base": 0.5},
     )
 
 
-def _cap(draw: Draw, radius: float, height: float) -> list[Patch]:
+def _cap(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
     """Create the cap of a bottle."""
     low = height - draw(1.5, 0.9, 2.2)
     top = height + 0.35
     under = np.array([[0.6 * radius, low], [radius, low]])
-    side = shapes.rounded([(radius, low), (radius, top), (0.6 * radius, top)], 0.3, 4)
+    side = shapes.round_corners(
+        [(radius, low), (radius, top), (0.6 * radius, top)], 0.3, 4
+    )
     return shapes.lathe(
         [
             ("cap", under),
-            ("cap", shapes.dense(side, 0.8)),
+            ("cap", shapes.subdivide(side, 0.8)),
             ("cap", [[0.6 * radius, top], [0.0, top]]),
         ],
         40,
@@ -344,7 +356,12 @@ def _cap(draw: Draw, radius: float, height: float) -> list[Patch]:
 
 
 def _labelled(
-    draw: Draw, surface: Paint, paper: Array, ink: Array, low: float, high: float
+    draw: ParameterSampler,
+    surface: Paint,
+    paper: Array,
+    ink: Array,
+    low: float,
+    high: float,
 ) -> Paint:
     """Paint a paper label opposite the texture's seam.
 
@@ -389,7 +406,7 @@ def _labelled(
 
 
 @family(metres=0.01)
-def vase(draw: Draw) -> Instance:
+def vase(draw: ParameterSampler) -> Instance:
     """Make a vase, perhaps with handles."""
     height = 24.0
     foot = draw(3.6, 2.6, 4.4)
@@ -412,15 +429,15 @@ def vase(draw: Draw) -> Instance:
     if draw.chance(0.25):
         low = belly_at + 0.15 * (neck_at - belly_at)
         high = neck_at - 0.2
-        ear = handle(draw, "ear", low, high, draw(1.6, 1.2, 2.4), profile, 0.2)
+        ear = make_handle(draw, "ear", low, high, draw(1.6, 1.2, 2.4), profile, 0.2)
         patches += [
-            *shapes.placed(ear, shapes.rotation("z", 130.0)),
-            *shapes.placed(ear, shapes.rotation("z", -50.0)),
+            *shapes.transform_patches(ear, shapes.rotation("z", 130.0)),
+            *shapes.transform_patches(ear, shapes.rotation("z", -50.0)),
         ]
     offset = draw.offset()
-    clay = draw.colour("f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a")
+    clay = draw.sample_color("f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a")
     glaze = clouded(clay, 0.95, 4.0, offset)
-    outer = natural(draw, height, _vase_paint(draw, glaze, height, offset))
+    outer = paint_or_random(draw, height, _vase_paint(draw, glaze, height, offset))
     paints = {
         "outside": outer,
         "inside": solid(shade(clay, 0.8)),
@@ -428,16 +445,18 @@ def vase(draw: Draw) -> Instance:
         "handle": glaze,
     }
     return Instance(
-        shapes.placed(patches, BACK),
+        shapes.transform_patches(patches, SEAM_ROTATION),
         paints,
-        finish(draw, 0.25, 0.6),
+        sample_material(draw, 0.25, 0.6),
         {"inside": 0.35, "base": 0.5},
     )
 
 
-def _vase_paint(draw: Draw, glaze: Paint, height: float, offset: Array) -> Paint:
+def _vase_paint(
+    draw: ParameterSampler, glaze: Paint, height: float, offset: Array
+) -> Paint:
     """Paint blue brushwork on the canonical vase; glazes, bands and drips on others."""
-    ink = draw.colour("23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
+    ink = draw.sample_color("23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
     if draw.rng is not None and draw.chance(0.6):
         return _ceramic(draw, height, glaze, clouded(ink, 1.3, 3.0, offset))
 
@@ -470,7 +489,7 @@ def _vase_paint(draw: Draw, glaze: Paint, height: float, offset: Array) -> Paint
 
 
 @family(metres=0.01)
-def wine_glass(draw: Draw) -> Instance:
+def wine_glass(draw: ParameterSampler) -> Instance:
     """Make a wine glass, perhaps with wine."""
     foot = draw(3.5, 2.9, 4.2)
     stem = draw(0.42, 0.32, 0.6)
@@ -514,7 +533,7 @@ def wine_glass(draw: Draw) -> Instance:
     floor = stem_top + 0.08 * deep
     edge = (inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))
     profile = [
-        ("foot", shapes.dense(under, 1.5)),
+        ("foot", shapes.subdivide(under, 1.5)),
         ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, 14)])),
         ("bowl", np.concatenate([outer, lip, inner[:1]])),
         ("inside", inner),
@@ -523,17 +542,21 @@ def wine_glass(draw: Draw) -> Instance:
     body = shapes.lathe(profile, 52)
     paints = _glass_paints(draw, stem_top, deep)
     return Instance(
-        shapes.placed(body, BACK), paints, finish(draw, 0.18, 0.8, spread=0.12)
+        shapes.transform_patches(body, SEAM_ROTATION),
+        paints,
+        sample_material(draw, 0.18, 0.8, spread=0.12),
     )
 
 
-def _glass_paints(draw: Draw, stem_top: float, depth: float) -> dict[str, Paint]:
+def _glass_paints(
+    draw: ParameterSampler, stem_top: float, depth: float
+) -> dict[str, Paint]:
     """Sample the paints of a glass with a stem of a height and a bowl of a depth."""
     height = stem_top + depth
-    tint = draw.colour(
+    tint = draw.sample_color(
         "c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3
     )
-    drink = draw.colour("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
+    drink = draw.sample_color("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
     level = stem_top + depth * draw(0.48, 0.3, 0.62)
     plain = gradient(shade(tint, 0.86), shade(tint, 1.08), 0.0, height)
     outside = inside = plain
@@ -541,7 +564,7 @@ def _glass_paints(draw: Draw, stem_top: float, depth: float) -> dict[str, Paint]
         wine = clouded(drink, 0.8, 3.0, draw.offset())
         outside = over(plain, between(stem_top + 0.06 * depth, level, soft=0.1), wine)
         inside = over(plain, between(0.0, level, soft=0.1), solid(drink))
-    outside = natural(draw, height, outside, 0.3)
+    outside = paint_or_random(draw, height, outside, 0.3)
     if draw.chance(0.2, True):
         outside = over(
             outside, between(height - 0.35, 2 * height, soft=0.1), solid("c9a24b")
@@ -549,5 +572,5 @@ def _glass_paints(draw: Draw, stem_top: float, depth: float) -> dict[str, Paint]
     if draw.chance(0.7, True):
         foot_paint = draw.pick(plain, outside, plain)
     else:
-        foot_paint = anything(draw, height)
+        foot_paint = sample_paint(draw, height)
     return {"foot": foot_paint, "bowl": outside, "inside": inside}

@@ -14,13 +14,13 @@ from pathlib import Path
 
 from advsearch.extend import errors, reading, stored_files
 
-PACKAGE = ".usdz"
-LAYERS = (".usd", ".usda", ".usdc")
-USD_LONGEST = 120  # timeout in seconds, before `scaled`
-MEMORY = 8 << 30  # limit of its memory in bytes, before `scaled`
-USD_BEGINNINGS = (b"PXR-USDC", b"#usda", b"PK\x03\x04")
-REFUSED = "refused: "
-_LIMITED = f"""
+PACKAGE_SUFFIX = ".usdz"
+LAYER_SUFFIXES = (".usd", ".usda", ".usdc")
+USD_TIMEOUT_S = 120  # timeout in seconds, before `scaled`
+MAX_MEMORY = 8 << 30  # limit of its memory in bytes, before `scaled`
+USD_MAGIC_BYTES = (b"PXR-USDC", b"#usda", b"PK\x03\x04")
+REJECTED_PREFIX = "refused: "
+_LIMITED_SCRIPT = f"""
 import runpy, sys
 try:
     import resource
@@ -46,8 +46,8 @@ def convert_usd(path: Path, data: bytes) -> bytes:
         FileFormatError: it is no OpenUSD file, names files outside its folder, is too
             large, or `usd-core` is not installed.
     """
-    if not data.startswith(USD_BEGINNINGS):
-        raise reading.damaged(path, "an OpenUSD file", reading.looks_like(data))
+    if not data.startswith(USD_MAGIC_BYTES):
+        raise reading.damaged(path, "an OpenUSD file", reading.describe_content(data))
     if not is_installed():
         raise errors.FileFormatError(
             f"{path}: an OpenUSD file needs usd-core, which is not installed: pip "
@@ -59,18 +59,18 @@ def convert_usd(path: Path, data: bytes) -> bytes:
         package_folder = Path(folder) / "package"
         package_folder.mkdir()
         arguments = [
-            str(stored_files.scaled(MEMORY)),
+            str(stored_files.scaled(MAX_MEMORY)),
             str(path.resolve()),
             str(target),
             str(package_folder),
         ]
-        program = [sys.executable, "-W", "ignore", "-c", _LIMITED, *arguments]
+        program = [sys.executable, "-W", "ignore", "-c", _LIMITED_SCRIPT, *arguments]
         process = reading.run_converter(
             path,
             "usd-core",
             program,
             folder=reading.OWN_FOLDER,
-            seconds=USD_LONGEST,
+            seconds=USD_TIMEOUT_S,
             env=None,
         )
         if process.returncode or not target.is_file():
@@ -88,15 +88,15 @@ def _conversion_error(
     """Return the error of a conversion that failed, by the last line of its output."""
     lines = [line for line in stderr.splitlines() if line.strip()]
     last = lines[-1] if lines else "without a word"
-    if last.startswith(REFUSED):
+    if last.startswith(REJECTED_PREFIX):
         # The process names the file without its folder.
-        message = last.removeprefix(REFUSED)
+        message = last.removeprefix(REJECTED_PREFIX)
         if message.startswith(path.name):
             return errors.FileFormatError(f"{path.parent / message}")
         return errors.FileFormatError(f"{path}: {message}")
     reason = f"signal {-returncode}"
     if returncode >= 0:
-        reason = reading.shown(last.strip(), quoted=False)
+        reason = reading.format_name(last.strip(), quoted=False)
     return errors.FileFormatError(
         f"{path}: usd-core could not read it ({reason}); export or download it again"
     )

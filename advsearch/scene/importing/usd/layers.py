@@ -18,14 +18,14 @@ from typing import Any
 from pxr import Ar, Sdf
 
 from advsearch.extend import errors, reading, stored_files
-from advsearch.scene.importing.usd import LAYERS, PACKAGE
+from advsearch.scene.importing.usd import LAYER_SUFFIXES, PACKAGE_SUFFIX
 
-MOST_LAYERS = 1000
-MOST_ENTRIES = 10_000
-DEEPEST_PACKAGE = 4  # limit of packages in packages
+MAX_LAYERS = 1000
+MAX_ENTRIES = 10_000
+MAX_PACKAGE_DEPTH = 4  # limit of packages in packages
 
 
-def unpacked(package: Path, folder: Path) -> Path:
+def unpack_package(package: Path, folder: Path) -> Path:
     """Unpack a .usdz file into a folder, and return its first layer.
 
     Raises:
@@ -37,7 +37,7 @@ def unpacked(package: Path, folder: Path) -> Path:
                 target = folder / PurePosixPath(entry.filename)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(archive.read(entry))
-        return folder / first_layer(archive)
+        return folder / find_first_layer(archive)
 
 
 def open_package(name: str, content: bytes) -> zipfile.ZipFile:
@@ -60,8 +60,8 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
         raise errors.FileFormatError(
             f"{name}: expected a .usdz archive, got one that is damaged ({error})"
         ) from None
-    first = first_layer(archive)
-    if Path(first).suffix.lower() not in LAYERS:
+    first = find_first_layer(archive)
+    if Path(first).suffix.lower() not in LAYER_SUFFIXES:
         raise errors.FileFormatError(
             f"{name}: expected a USD layer first in it, got {first[:80]!r}"
         )
@@ -73,10 +73,10 @@ def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
     entries = archive.infolist()
     size = sum(entry.file_size for entry in entries)
     got = f"{len(entries):,} of {size:,}"
-    max_files = stored_files.scaled(MOST_ENTRIES)
+    max_files = stored_files.scaled(MAX_ENTRIES)
     max_bytes = stored_files.scaled(stored_files.LARGEST_FILE)
     expected = f"at most {max_files:,} files of {max_bytes:,} bytes in all"
-    stored_files.check_most(name, len(entries), MOST_ENTRIES, expected, got)
+    stored_files.check_most(name, len(entries), MAX_ENTRIES, expected, got)
     stored_files.check_most(name, size, stored_files.LARGEST_FILE, expected, got)
     for entry in entries:
         path = PurePosixPath(entry.filename)
@@ -114,7 +114,7 @@ def _check_without_gaps(name: str, archive: zipfile.ZipFile, content: bytes) -> 
         position = entry.header_offset + header_size + entry.file_size
 
 
-def first_layer(archive: zipfile.ZipFile) -> str:
+def find_first_layer(archive: zipfile.ZipFile) -> str:
     """Return the name of the first file in a package, which is its layer, or ""."""
     for entry in archive.infolist():
         if not entry.is_dir():
@@ -172,29 +172,29 @@ class _LayerCheck:
             if path in known:
                 continue
             known[path] = None
-            self._take(path.stat().st_size)
-            if path.suffix.lower() == PACKAGE:
+            self._count_layer(path.stat().st_size)
+            if path.suffix.lower() == PACKAGE_SUFFIX:
                 content = stored_files.read_bytes(
                     path, "a package", stored_files.LARGEST_FILE
                 )
                 self._check_package(path.name, str(path), content, depth=1)
                 continue
-            for name in self._named_in(str(path), path.name):
-                waiting.append(self._find(path, name))
+            for name in self._iterate_named_layers(str(path), path.name):
+                waiting.append(self._find_layer(path, name))
         return list(known)
 
-    def _take(self, size: int) -> None:
+    def _count_layer(self, size: int) -> None:
         """Count a layer of a size in bytes against the limits."""
         self._count += 1
         self._size += size
-        expected = f"at most {stored_files.scaled(MOST_LAYERS):,} layers"
+        expected = f"at most {stored_files.scaled(MAX_LAYERS):,} layers"
         got = "more, or larger ones"
-        stored_files.check_most(self.file.name, self._count, MOST_LAYERS, expected, got)
+        stored_files.check_most(self.file.name, self._count, MAX_LAYERS, expected, got)
         stored_files.check_most(
             self.file.name, self._size, stored_files.LARGEST_FILE, expected, got
         )
 
-    def _find(self, path: Path, name: str) -> Path:
+    def _find_layer(self, path: Path, name: str) -> Path:
         """Return the file that a layer names; of a file in a package, the package.
 
         Raises:
@@ -203,7 +203,7 @@ class _LayerCheck:
         outer, inner = Ar.SplitPackageRelativePathOuter(name)
         suffix = Path(outer).suffix.lower()
         has_odd_name = any(sign in outer for sign in "`[]:\0")
-        is_layer = suffix == PACKAGE or (suffix in LAYERS and not inner)
+        is_layer = suffix == PACKAGE_SUFFIX or (suffix in LAYER_SUFFIXES and not inner)
         is_plain = is_layer and not has_odd_name
         target = self._folder
         if is_plain:
@@ -241,7 +241,7 @@ class _LayerCheck:
         stored_files.check_most(
             self.file.name,
             depth,
-            DEEPEST_PACKAGE,
+            MAX_PACKAGE_DEPTH,
             "packages in at most {} others",
             "more",
         )
@@ -253,15 +253,15 @@ class _LayerCheck:
             for entry in sorted(entries):
                 suffix = Path(entry).suffix.lower()
                 inner_path = Ar.JoinPackageRelativePath(path, entry)
-                if suffix == PACKAGE:
-                    self._take(0)
+                if suffix == PACKAGE_SUFFIX:
+                    self._count_layer(0)
                     self._check_package(
                         f"{name}[{entry}]", inner_path, archive.read(entry), depth + 1
                     )
-                elif suffix in LAYERS:
-                    self._take(0)  # its bytes are those of the package
-                    label = f"{name}[{reading.shown(entry, quoted=False)}]"
-                    for layer in self._named_in(inner_path, label):
+                elif suffix in LAYER_SUFFIXES:
+                    self._count_layer(0)  # its bytes are those of the package
+                    label = f"{name}[{reading.format_name(entry, quoted=False)}]"
+                    for layer in self._iterate_named_layers(inner_path, label):
                         self._check_packaged(name, entry, layer, entries)
 
     def _check_packaged(
@@ -275,7 +275,10 @@ class _LayerCheck:
         is_inside = from_entry in entries or (
             not outer.startswith(".") and from_root in entries
         )
-        if not is_inside or Path(outer).suffix.lower() not in (*LAYERS, PACKAGE):
+        if not is_inside or Path(outer).suffix.lower() not in (
+            *LAYER_SUFFIXES,
+            PACKAGE_SUFFIX,
+        ):
             raise errors.FileFormatError(
                 f"{self.file.name}: {package} names the layer {layer[:100]!r}, which "
                 "is no USD file in that package "
@@ -283,13 +286,13 @@ class _LayerCheck:
                 "all with usdcat --flatten"
             )
 
-    def _named_in(self, path: str, name: str) -> Iterator[str]:
+    def _iterate_named_layers(self, path: str, name: str) -> Iterator[str]:
         """Yield the layers that a layer names, and reject value clips."""
         try:
             layer = Sdf.Layer.FindOrOpen(path)
         except Exception as error:  # Tf.ErrorException, of which there are many kinds
             raise errors.FileFormatError(
-                f"{name}: expected a USD layer, got {shorten(error)}"
+                f"{name}: expected a USD layer, got {format_error(error)}"
             ) from None
         if layer is None:
             raise errors.FileFormatError(
@@ -310,7 +313,7 @@ class _LayerCheck:
         layer.Traverse(Sdf.Path.absoluteRootPath, check_clips)
 
 
-def shorten(error: Exception) -> str:
+def format_error(error: Exception) -> str:
     """Return the message of an error of usd-core in one line."""
     text = str(error)
     lines = (

@@ -18,7 +18,7 @@ Array = npt.NDArray[Any]
 EXR = b"\x76\x2f\x31\x01"
 RADIANCE = b"#?"
 PNG = b"\x89PNG"
-LONGEST_SIDE = 1024  # limit of the sides of an image that is computed anew, texels
+MAX_SIDE = 1024  # limit of the sides of an image that is computed anew, texels
 MODES_OF_8_BITS = ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "YCbCr")
 GREY_MODES = ("1", "L", "LA")
 GAMMA_OF_SRGB = 0.45455
@@ -60,7 +60,7 @@ def is_marked_srgb(data: bytes) -> bool:
     return has_colors_of_8_bits(data)
 
 
-def decode_picture(data: bytes, path: str, *, is_srgb: bool) -> Array:
+def decode_image(data: bytes, path: str, *, is_srgb: bool) -> Array:
     """Return the linear values (H, W, 4) float32 of an image file.
 
     Large images are averaged down.
@@ -82,10 +82,10 @@ def decode_picture(data: bytes, path: str, *, is_srgb: bool) -> Array:
         linear = color.srgb_to_linear(texels[:, :, :3])
         texels = np.concatenate([linear, texels[:, :, 3:]], axis=2)
     height, width = texels.shape[:2]
-    shrink = LONGEST_SIDE / max(height, width)
+    shrink = MAX_SIDE / max(height, width)
     if shrink >= 1.0:
         return np.asarray(texels, np.float32)
-    return reading.pictures.area_average(
+    return reading.pictures.average_area(
         texels.astype(np.float32),
         max(1, round(height * shrink)),
         max(1, round(width * shrink)),
@@ -103,12 +103,12 @@ def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
             return np.stack([grey, grey, grey, np.ones_like(grey)], axis=2)
         if _is_png_of_16_bits(data):
             return _decode_png_of_16_bits(data, image.size)
-        return reading.pictures.display_image(
+        return reading.pictures.load_display_image(
             image,
-            LONGEST_SIDE if is_srgb else None,
+            MAX_SIDE if is_srgb else None,
             path,
-            alpha=True,
-            raw=not is_srgb,
+            keep_alpha=True,
+            is_raw=not is_srgb,
         )
 
 
@@ -119,7 +119,7 @@ def _decode_radiance(data: bytes, path: str) -> Array:
         colors = np.stack([np.asarray(plane, np.float32) for plane in planes], axis=2)
     else:
         pixels, scale, _ = reading.hdr.read_radiance(Path(path), data)
-        colors = reading.hdr.linear(pixels) * scale
+        colors = reading.hdr.decode_rgbe(pixels) * scale
     colors = np.nan_to_num(colors)
     return np.concatenate([colors, np.ones_like(colors[:, :, :1])], axis=2)
 

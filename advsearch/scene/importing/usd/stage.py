@@ -21,19 +21,19 @@ import numpy.typing as npt
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from advsearch.extend import errors, reading, stored_files
-from advsearch.scene.importing.usd import PACKAGE
-from advsearch.scene.importing.usd.layers import check_layers, unpacked
+from advsearch.scene.importing.usd import PACKAGE_SUFFIX
+from advsearch.scene.importing.usd.layers import check_layers, unpack_package
 from advsearch.scene.importing.usd.surface import (
-    FIRST,
+    FIRST_TIME,
     BoundMaterial,
-    Layout,
     PrimvarUse,
+    TextureLayout,
     UsdSurfaces,
 )
 
 # Limit of the colors, and of the opacities, of faces that become materials.
-MOST_TINTS = 16
-PARTICLES = "ParticleField"  # prefix of the types of Gaussian splats
+MAX_TINTS = 16
+PARTICLES_PREFIX = "ParticleField"  # prefix of the types of Gaussian splats
 PURPOSES = ("default", "render")
 Array = npt.NDArray[Any]
 
@@ -50,13 +50,13 @@ def main(source: str, target: str, folder: str) -> None:
         FileFormatError: the file cannot be converted; the message begins with its name.
     """
     file = Path(source)
-    if file.suffix.lower() == PACKAGE:
-        file = unpacked(file, Path(folder))
+    if file.suffix.lower() == PACKAGE_SUFFIX:
+        file = unpack_package(file, Path(folder))
     layers = check_layers(file)
     stage = Usd.Stage.Open(str(file))
     conversion = Conversion(stage, file.parent.resolve(), Path(source).name, layers)
-    Path(target).write_bytes(conversion.glb())
-    print(json.dumps(conversion.read if file == Path(source) else []))
+    Path(target).write_bytes(conversion.convert())
+    print(json.dumps(conversion.files_read if file == Path(source) else []))
 
 
 # ---- The stage ----
@@ -69,8 +69,10 @@ class Conversion:
     stage: Any
     folder: Path  # where its files are
     source: str  # name of the file, for messages
-    read: list[str]  # files that were read
-    left: Counter[str] = field(default_factory=Counter)  # notes on what is left out
+    files_read: list[str]  # files that were read
+    note_counts: Counter[str] = field(
+        default_factory=Counter
+    )  # notes on what is left out
     buffer: reading.GlbBuffer = field(default_factory=reading.GlbBuffer)
     triangles: int = 0
 
@@ -85,14 +87,14 @@ class Conversion:
         }
         self.lights: list[dict[str, Any]] = []
         self._surfaces = UsdSurfaces(
-            self.folder, self.header, self.buffer, self.left, self.read
+            self.folder, self.header, self.buffer, self.note_counts, self.files_read
         )
         self._skins = UsdSkel.Cache()
-        for prim in self._prims():
+        for prim in self._iterate_prims():
             if prim.IsA(UsdSkel.Root):
                 self._skins.Populate(UsdSkel.Root(prim), Usd.TraverseInstanceProxies())
 
-    def _prims(self) -> Iterator[Any]:
+    def _iterate_prims(self) -> Iterator[Any]:
         """Yield the prims of the stage, within limits."""
         prims = Usd.PrimRange(self.stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
         for index, prim in enumerate(prims):
@@ -113,11 +115,11 @@ class Conversion:
             )
             yield prim
 
-    def glb(self) -> bytes:
+    def convert(self) -> bytes:
         """Return the stage as a binary glTF file."""
         self.unit = self._read_unit()
         if self.stage.HasAuthoredTimeCodeRange():
-            self._leave("is animated; what is there first is read")
+            self._note("is animated; what is there first is read")
         to_y_up = _TO_Y_UP
         if UsdGeom.GetStageUpAxis(self.stage) == "Y":
             to_y_up = np.eye(4)
@@ -127,11 +129,11 @@ class Conversion:
         nodes.append(
             {"name": "stage", "matrix": matrix.T.ravel().tolist(), "children": []}
         )
-        name_counts = Counter(prim.GetName() for prim in self._prims())
+        name_counts = Counter(prim.GetName() for prim in self._iterate_prims())
         node_of_path: dict[Any, int] = {}
         has_splats = False
-        for prim in self._prims():
-            if str(prim.GetTypeName()).startswith(PARTICLES):
+        for prim in self._iterate_prims():
+            if str(prim.GetTypeName()).startswith(PARTICLES_PREFIX):
                 has_splats = True
             self._note_left_out(prim)
             if prim.IsA(UsdGeom.Imageable) and not prim.IsA(UsdGeom.Subset):
@@ -145,12 +147,12 @@ class Conversion:
         if has_splats and not header["meshes"]:
             raise errors.FileFormatError(
                 f"{self.source}: expected a mesh with faces, got Gaussian splats, a "
-                f"model that {reading.SPLATS}"
+                f"model that {reading.SPLATS_ADVICE}"
             )
         if self.lights:
             header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
-        header["asset"]["extras"] = {"left_out": self._notes(has_splats)}
-        return self.buffer.file(
+        header["asset"]["extras"] = {"left_out": self._format_notes(has_splats)}
+        return self.buffer.to_bytes(
             {key: value for key, value in header.items() if value or key == "asset"}
         )
 
@@ -162,25 +164,25 @@ class Conversion:
                 f"{self.source}: expected metersPerUnit greater than 0, got {unit}"
             )
         if not UsdGeom.StageHasAuthoredMetersPerUnit(self.stage):
-            self._leave("does not say its unit, which USD takes for centimetres")
+            self._note("does not say its unit, which USD takes for centimetres")
         return unit
 
     def _note_left_out(self, prim: Any) -> None:
         """Note what is left out of a prim."""
         kind = str(prim.GetTypeName())
         is_other_geometry = prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh)
-        if not kind.startswith(PARTICLES):
+        if not kind.startswith(PARTICLES_PREFIX):
             if is_other_geometry or kind == "PointInstancer":
-                self._leave(
+                self._note(
                     f"has a {kind}, which is no mesh: left out; make meshes of "
                     "it where the file is from"
                 )
         if prim.HasAPI(UsdSkel.BindingAPI):
             blend_shapes = UsdSkel.BindingAPI(prim).GetBlendShapesAttr()
             if blend_shapes.HasAuthoredValue():
-                self._leave("has a mesh with blend shapes, which are left out")
+                self._note("has a mesh with blend shapes, which are left out")
         if kind == "SkelAnimation":
-            self._leave("has an animation of a skeleton, which is shown at rest")
+            self._note("has an animation of a skeleton, which is shown at rest")
 
     def _add_node(
         self, prim: Any, is_unique: bool, node_of_path: dict[Any, int]
@@ -200,7 +202,7 @@ class Conversion:
         xformable = UsdGeom.Xformable(prim)
         if xformable:
             # USD's rows are glTF's columns.
-            local = np.array(xformable.GetLocalTransformation(FIRST))
+            local = np.array(xformable.GetLocalTransformation(FIRST_TIME))
             if not np.isfinite(local).all():
                 raise errors.FileFormatError(
                     f"{self.source}: expected finite transforms, got others at {path}"
@@ -211,7 +213,7 @@ class Conversion:
             parent = next(
                 (node_of_path[at] for at in ancestors if at in node_of_path), 0
             )
-        self._fill(prim, node)
+        self._add_content(prim, node)
         if "moved" in node:
             # The skeleton places it in the world.
             node["matrix"] = node.pop("moved")
@@ -220,62 +222,62 @@ class Conversion:
         nodes[parent]["children"].append(len(nodes))
         nodes.append(node)
 
-    def _notes(self, has_splats: bool) -> list[str]:
+    def _format_notes(self, has_splats: bool) -> list[str]:
         """Return the sentences about what is left out, at most 100."""
         notes = [
             sentence if count == 1 else f"{sentence} ({count:,} times)"
-            for sentence, count in self.left.items()
+            for sentence, count in self.note_counts.items()
         ]
         if has_splats:
             notes.insert(
                 0,
                 "has Gaussian splats, which are left out: a model that "
-                f"{reading.SPLATS}",
+                f"{reading.SPLATS_ADVICE}",
             )
         return notes[:100]
 
-    def _leave(self, what: str) -> None:
+    def _note(self, what: str) -> None:
         """Note something that is left out."""
-        self.left[what] += 1
+        self.note_counts[what] += 1
 
-    def _fill(self, prim: Any, node: dict[str, Any]) -> None:
+    def _add_content(self, prim: Any, node: dict[str, Any]) -> None:
         """Add the mesh, camera or light of a prim to its node."""
         is_mesh = prim.IsA(UsdGeom.Mesh)
         is_camera = prim.IsA(UsdGeom.Camera)
         if not (is_mesh or is_camera or prim.HasAPI(UsdLux.LightAPI)):
             return
         imageable = UsdGeom.Imageable(prim)
-        if imageable.ComputeVisibility(FIRST) == UsdGeom.Tokens.invisible:
-            self._leave("has something invisible, which is left out")
+        if imageable.ComputeVisibility(FIRST_TIME) == UsdGeom.Tokens.invisible:
+            self._note("has something invisible, which is left out")
         elif imageable.ComputePurpose() not in PURPOSES:
-            self._leave(
+            self._note(
                 "has something for the purpose "
                 f"{imageable.ComputePurpose()!r}, which is left out"
             )
         elif is_mesh:
-            self._mesh(prim, node)
+            self._add_mesh(prim, node)
         elif is_camera:
-            self._camera(UsdGeom.Camera(prim), node)
+            self._add_camera(UsdGeom.Camera(prim), node)
         else:
-            self._light(prim, node)
+            self._add_light(prim, node)
 
     # ---- Cameras and lights ----
 
-    def _camera(self, camera: Any, node: dict[str, Any]) -> None:
+    def _add_camera(self, camera: Any, node: dict[str, Any]) -> None:
         """Add a camera to a node; one that is not perspective counts as left out."""
-        width = _first(camera, "HorizontalAperture")
-        height = _first(camera, "VerticalAperture")
-        focal_length = _first(camera, "FocalLength")
+        width = _get_first(camera, "HorizontalAperture")
+        height = _get_first(camera, "VerticalAperture")
+        focal_length = _get_first(camera, "FocalLength")
         is_perspective = (
-            _first(camera, "Projection") == UsdGeom.Tokens.perspective
+            _get_first(camera, "Projection") == UsdGeom.Tokens.perspective
             and min(width, height, focal_length) > 0.0
         )
         entry: dict[str, Any] = {"name": node["name"], "type": "orthographic"}
         if is_perspective:
-            if _first(camera, "HorizontalApertureOffset") or _first(
+            if _get_first(camera, "HorizontalApertureOffset") or _get_first(
                 camera, "VerticalApertureOffset"
             ):
-                self._leave(
+                self._note(
                     "has a camera whose aperture is shifted; the shift is left out"
                 )
             perspective = {
@@ -287,18 +289,18 @@ class Conversion:
         node["camera"] = len(self.header["cameras"])
         self.header["cameras"].append(entry)
 
-    def _light(self, prim: Any, node: dict[str, Any]) -> None:
+    def _add_light(self, prim: Any, node: dict[str, Any]) -> None:
         """Add a distant or a spherical light to a node."""
         light = UsdLux.LightAPI(prim)
         kind = prim.GetTypeName()
-        power = _first(light, "Intensity") * 2.0 ** _first(light, "Exposure")
-        is_normalized = _first(light, "Normalize")
-        color = np.array(_first(light, "Color"), np.float64)
-        if _first(light, "EnableColorTemperature"):
-            temperature = _first(light, "ColorTemperature")
+        power = _get_first(light, "Intensity") * 2.0 ** _get_first(light, "Exposure")
+        is_normalized = _get_first(light, "Normalize")
+        color = np.array(_get_first(light, "Color"), np.float64)
+        if _get_first(light, "EnableColorTemperature"):
+            temperature = _get_first(light, "ColorTemperature")
             color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(temperature))
         if kind == "DistantLight":
-            angle = _first(UsdLux.DistantLight(prim), "Angle")
+            angle = _get_first(UsdLux.DistantLight(prim), "Angle")
             half_angle = math.radians(angle) / 2.0
             entry: dict[str, Any] = {"type": "directional"}
             if not is_normalized and half_angle > 0.0:
@@ -309,12 +311,12 @@ class Conversion:
             if is_normalized:
                 power *= 0.25
             else:
-                power *= math.pi * _first(UsdLux.SphereLight(prim), "Radius") ** 2
+                power *= math.pi * _get_first(UsdLux.SphereLight(prim), "Radius") ** 2
             power *= self.unit**2
-            entry = _shaped_light(prim)
-            self._leave("has a SphereLight, which shines from its middle here")
+            entry = _make_point_light(prim)
+            self._note("has a SphereLight, which shines from its middle here")
         else:
-            self._leave(
+            self._note(
                 f"has a {kind}, which is left out; `environment` and "
                 "`controls=light` light a scene"
             )
@@ -333,24 +335,24 @@ class Conversion:
 
     # ---- Meshes ----
 
-    def _mesh(self, prim: Any, node: dict[str, Any]) -> None:
+    def _add_mesh(self, prim: Any, node: dict[str, Any]) -> None:
         """Add a mesh to a node: one primitive for each material and tint."""
         mesh = UsdGeom.Mesh(prim)
-        points = _array(_first(mesh, "Points"), np.float64, 3)
-        counts = _array(_first(mesh, "FaceVertexCounts"), np.int64)
-        corners = _array(_first(mesh, "FaceVertexIndices"), np.int64)
+        points = _to_array(_get_first(mesh, "Points"), np.float64, 3)
+        counts = _to_array(_get_first(mesh, "FaceVertexCounts"), np.int64)
+        corners = _to_array(_get_first(mesh, "FaceVertexIndices"), np.int64)
         if not len(points) or not len(counts):
             return
         self._check_corners(prim, len(points), counts, corners)
-        rest_matrix, points = self._at_rest(prim, points)
+        rest_matrix, points = self._pose_at_rest(prim, points)
         if rest_matrix is not None:
             node["moved"] = rest_matrix.ravel().tolist()
         triangles, face = self._triangulate(mesh, points, counts, corners)
         primvars = UsdGeom.PrimvarsAPI(prim)
-        normals = self._normals(mesh, primvars, points, corners[triangles])
+        normals = self._read_normals(mesh, primvars, points, corners[triangles])
         primitives = []
-        for bound, faces in self._groups(prim, mesh, len(counts)):
-            for material, colors, tinted_faces in self._tinted(
+        for bound, faces in self._iterate_materials(prim, mesh, len(counts)):
+            for material, colors, tinted_faces in self._split_by_tint(
                 bound, primvars, faces, counts, corners
             ):
                 is_selected = np.isin(face, tinted_faces)
@@ -362,8 +364,8 @@ class Conversion:
                     "COLOR_0": colors,
                 }
                 for index, layout in enumerate(bound.layouts):
-                    attributes[f"TEXCOORD_{index}"] = self._uvs(primvars, layout)
-                entry = self._primitive(
+                    attributes[f"TEXCOORD_{index}"] = self._read_uvs(primvars, layout)
+                entry = self._make_primitive(
                     str(prim.GetPath()),
                     points,
                     corners,
@@ -402,32 +404,32 @@ class Conversion:
         """
         self.triangles += int(np.maximum(counts - 2, 0).sum())
         reading.check_faces(self.source, self.triangles, "more")
-        triangles, face, _ = reading.triangulated(points[corners], counts)
-        holes = _array(_first(mesh, "HoleIndices"), np.int64)
+        triangles, face, _ = reading.triangulate(points[corners], counts)
+        holes = _to_array(_get_first(mesh, "HoleIndices"), np.int64)
         is_solid = ~np.isin(face, holes)
         triangles = triangles[is_solid]
-        if _first(mesh, "Orientation") == UsdGeom.Tokens.leftHanded:
+        if _get_first(mesh, "Orientation") == UsdGeom.Tokens.leftHanded:
             triangles = triangles[:, ::-1]
         return triangles, face[is_solid]
 
-    def _normals(
+    def _read_normals(
         self, mesh: Any, primvars: Any, points: Array, triangles: Array
     ) -> tuple[Array, str] | None:
         """Return the normals (N, 3) of a mesh and their interpolation, or None."""
-        normals = _flattened(primvars.GetPrimvar("normals"), 3)
+        normals = _flatten_primvar(primvars.GetPrimvar("normals"), 3)
         if normals is None:
-            values = _array(_first(mesh, "Normals"), np.float64, 3)
+            values = _to_array(_get_first(mesh, "Normals"), np.float64, 3)
             if len(values):
                 normals = values, str(mesh.GetNormalsInterpolation())
-        if _first(mesh, "SubdivisionScheme") != UsdGeom.Tokens.none:
-            self._leave(
+        if _get_first(mesh, "SubdivisionScheme") != UsdGeom.Tokens.none:
+            self._note(
                 "has a mesh that is to be subdivided, which is shown as it is, "
                 "and smooth"
             )
-            normals = _smooth(points, triangles), "vertex"
+            normals = _compute_smooth_normals(points, triangles), "vertex"
         return normals
 
-    def _primitive(
+    def _make_primitive(
         self,
         path: str,
         points: Array,
@@ -470,7 +472,7 @@ class Conversion:
             np.stack(indices, axis=1), axis=0, return_inverse=True
         )
         accessors = {
-            "POSITION": self.buffer.accessor(
+            "POSITION": self.buffer.add_accessor(
                 points[rows[:, 0]].astype(np.float32), "VEC3", bounds=True
             )
         }
@@ -478,13 +480,15 @@ class Conversion:
             if attribute is not None:
                 values = attribute[0][rows[:, column]].astype(np.float32)
                 kind = f"VEC{values.shape[1]}"
-                accessors[name] = self.buffer.accessor(values, kind)
-        index_accessor = self.buffer.accessor(
+                accessors[name] = self.buffer.add_accessor(values, kind)
+        index_accessor = self.buffer.add_accessor(
             inverse.reshape(-1).astype(np.uint32), "SCALAR"
         )
         return {"attributes": accessors, "mode": 4, "indices": index_accessor}
 
-    def _uvs(self, primvars: Any, layout: Layout) -> tuple[Array, str] | None:
+    def _read_uvs(
+        self, primvars: Any, layout: TextureLayout
+    ) -> tuple[Array, str] | None:
         """Return texture coordinates as glTF has them, v down, or None.
 
         The transform of the material is applied.
@@ -494,23 +498,25 @@ class Conversion:
         """
         values = None
         if layout.primvar:
-            values = _flattened(primvars.FindPrimvarWithInheritance(layout.primvar), 2)
+            values = _flatten_primvar(
+                primvars.FindPrimvarWithInheritance(layout.primvar), 2
+            )
         if values is None:
             if layout.fallback is None:
                 return None
             if layout.primvar:
                 name = layout.primvar[:50]
-                self._leave(
+                self._note(
                     f"has a mesh without the primvar {name!r} of a texture, of "
                     "which one texel is shown"
                 )
             values = np.array([layout.fallback]), "constant"
         st, interpolation = values
-        transformed = layout.moved(st)
+        transformed = layout.transform(st)
         uvs = np.stack([transformed[:, 0], 1.0 - transformed[:, 1]], axis=1)
         return uvs, interpolation
 
-    def _tinted(
+    def _split_by_tint(
         self,
         bound: BoundMaterial,
         primvars: Any,
@@ -534,25 +540,25 @@ class Conversion:
             Index of a glTF material, vertex colors or None, and faces.
         """
         if bound.color is None and bound.opacity is None:
-            yield bound.number, None, faces
+            yield bound.index, None, faces
             return
         if bound.is_default:
             has_color = primvars.FindPrimvarWithInheritance("displayColor").HasValue()
             color_words = " and displayColor: grey (0.18)"
             if has_color:
                 color_words = ": of its displayColor"
-            self._leave(
+            self._note(
                 f"has a mesh without material{color_words}, with roughness 0.5 "
                 "and no metal, as USD's default"
             )
-        colors = _primvar_values(primvars, bound.color)
-        opacities = _primvar_values(primvars, bound.opacity)
-        opacity = self._face_opacities(opacities, faces, counts, corners)
+        colors = _read_primvar(primvars, bound.color)
+        opacities = _read_primvar(primvars, bound.opacity)
+        opacity = self._compute_face_opacities(opacities, faces, counts, corners)
         tints = np.full((len(faces), 3), np.nan)
         vertex_colors = colors
         if colors is not None and colors[1] in ("constant", "uniform"):
-            face_colors = _values_of_faces(colors, faces, counts, corners)
-            if len(np.unique(face_colors, axis=0)) <= MOST_TINTS:
+            face_colors = _compute_face_values(colors, faces, counts, corners)
+            if len(np.unique(face_colors, axis=0)) <= MAX_TINTS:
                 tints = face_colors
                 vertex_colors = None
         keys = np.nan_to_num(np.concatenate([tints, opacity], axis=1), nan=-1.0)
@@ -562,10 +568,10 @@ class Conversion:
             if vertex_colors is not None:
                 color = np.ones(3)  # it is multiplied by vertex colors
             key_opacity = None if key[3] < 0.0 else key[3]
-            material = self._surfaces.tinted(bound, color, key_opacity)
+            material = self._surfaces.make_tinted(bound, color, key_opacity)
             yield material, vertex_colors, faces[is_selected]
 
-    def _face_opacities(
+    def _compute_face_opacities(
         self,
         opacities: tuple[Array, str] | None,
         faces: Array,
@@ -574,40 +580,40 @@ class Conversion:
     ) -> Array:
         """Return the opacity of each face, (F, 1); NaN where the material's holds.
 
-        Arguments are those of `_values_of_faces`.
+        Arguments are those of `_compute_face_values`.
         """
         if opacities is None:
             return np.full((len(faces), 1), np.nan)
-        face_values = _values_of_faces(opacities, faces, counts, corners)
+        face_values = _compute_face_values(opacities, faces, counts, corners)
         opacity = np.round(face_values.clip(0.0, 1.0) * 255.0) / 255.0
         values, interpolation = opacities
         is_of_vertices = interpolation not in ("constant", "uniform")
         if is_of_vertices and len(np.unique(values)) > 1:
-            self._leave("has an opacity of vertices, of which faces have the mean")
-        if len(np.unique(opacity)) > MOST_TINTS:
-            self._leave(
-                f"has more than {MOST_TINTS} opacities of faces, of which the "
+            self._note("has an opacity of vertices, of which faces have the mean")
+        if len(np.unique(opacity)) > MAX_TINTS:
+            self._note(
+                f"has more than {MAX_TINTS} opacities of faces, of which the "
                 "mean is read"
             )
             opacity = np.full_like(opacity, opacity.mean())
         return opacity
 
-    def _groups(
+    def _iterate_materials(
         self, prim: Any, mesh: Any, faces: int
     ) -> Iterator[tuple[BoundMaterial, Array]]:
         """Yield the materials of a mesh and their faces."""
         subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
         is_unbound = np.ones(faces, bool)
         for subset in subsets:
-            selected = np.unique(_array(_first(subset, "Indices"), np.int64))
+            selected = np.unique(_to_array(_get_first(subset, "Indices"), np.int64))
             selected = selected[(selected >= 0) & (selected < faces)]
             selected = selected[is_unbound[selected]]
             is_unbound[selected] = False
-            yield self._surfaces.bound_to(subset.GetPrim()), selected
+            yield self._surfaces.find_material(subset.GetPrim()), selected
         if is_unbound.any():
-            yield self._surfaces.bound_to(prim), np.flatnonzero(is_unbound)
+            yield self._surfaces.find_material(prim), np.flatnonzero(is_unbound)
 
-    def _at_rest(self, prim: Any, points: Array) -> tuple[Array | None, Array]:
+    def _pose_at_rest(self, prim: Any, points: Array) -> tuple[Array | None, Array]:
         """Pose the points of a mesh by its skeleton at rest.
 
         Returns:
@@ -621,7 +627,7 @@ class Conversion:
         query = self._skins.GetSkelQuery(skeleton) if skeleton else None
         if not query:
             return None, points
-        rest = query.ComputeJointSkelTransforms(FIRST, atRest=True)
+        rest = query.ComputeJointSkelTransforms(FIRST_TIME, atRest=True)
         binding = query.GetJointWorldBindTransforms()
         if not rest or len(rest) != len(binding):
             return None, points
@@ -633,28 +639,28 @@ class Conversion:
             transforms = mapper.RemapTransforms(type(rest)(transforms))
         skinned = Vt.Vec3fArray([Gf.Vec3f(*map(float, point)) for point in points])
         matrices = Vt.Matrix4dArray(list(transforms))
-        if not skin.ComputeSkinnedPoints(matrices, skinned, FIRST):
+        if not skin.ComputeSkinnedPoints(matrices, skinned, FIRST_TIME):
             return None, points
         xformable = UsdGeom.Xformable(skeleton.GetPrim())
-        to_world = xformable.ComputeLocalToWorldTransform(FIRST)
-        return np.array(to_world), _array(skinned, np.float64, 3)
+        to_world = xformable.ComputeLocalToWorldTransform(FIRST_TIME)
+        return np.array(to_world), _to_array(skinned, np.float64, 3)
 
 
-def _shaped_light(prim: Any) -> dict[str, Any]:
+def _make_point_light(prim: Any) -> dict[str, Any]:
     """Return the entry of a point light, or of a spot light if the prim has a cone."""
     if not prim.HasAPI(UsdLux.ShapingAPI):
         return {"type": "point"}
     shaping = UsdLux.ShapingAPI(prim)
-    cone = _first(shaping, "ShapingConeAngle")
+    cone = _get_first(shaping, "ShapingConeAngle")
     if cone is None or cone >= 90.0:
         return {"type": "point"}
-    softness = _first(shaping, "ShapingConeSoftness") or 0.0
+    softness = _get_first(shaping, "ShapingConeSoftness") or 0.0
     outer = math.radians(max(cone, 0.1))
     inner = outer * (1.0 - min(softness, 1.0))
     return {"type": "spot", "spot": {"outerConeAngle": outer, "innerConeAngle": inner}}
 
 
-def _values_of_faces(
+def _compute_face_values(
     primvar: tuple[Array, str], faces: Array, counts: Array, corners: Array
 ) -> Array:
     """Return the values (F, C) of faces; those of corners are averaged.
@@ -685,20 +691,20 @@ def _values_of_faces(
 _TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 
 
-def _first(schema: Any, name: str) -> Any:
+def _get_first(schema: Any, name: str) -> Any:
     """Return the first value in time of an attribute."""
-    return getattr(schema, f"Get{name}Attr")().Get(FIRST)
+    return getattr(schema, f"Get{name}Attr")().Get(FIRST_TIME)
 
 
-def _flattened(primvar: Any, width: int) -> tuple[Array, str] | None:
+def _flatten_primvar(primvar: Any, width: int) -> tuple[Array, str] | None:
     """Return the values (N, width) of a primvar and their interpolation, or None."""
     if not primvar or not primvar.HasValue():
         return None
-    values = _array(primvar.ComputeFlattened(FIRST), np.float64, width)
+    values = _to_array(primvar.ComputeFlattened(FIRST_TIME), np.float64, width)
     return values, str(primvar.GetInterpolation())
 
 
-def _primvar_values(primvars: Any, use: PrimvarUse | None) -> tuple[Array, str] | None:
+def _read_primvar(primvars: Any, use: PrimvarUse | None) -> tuple[Array, str] | None:
     """Return the values (N, C) of a primvar that a surface uses, or of its fallback.
 
     Returns:
@@ -709,21 +715,21 @@ def _primvar_values(primvars: Any, use: PrimvarUse | None) -> tuple[Array, str] 
     values = None
     if use.name:
         primvar = primvars.FindPrimvarWithInheritance(use.name)
-        values = _flattened(primvar, len(use.fallback))
+        values = _flatten_primvar(primvar, len(use.fallback))
     if values is None or not len(values[0]):
         return np.array([use.fallback]), "constant"
     return np.nan_to_num(values[0]), values[1]
 
 
-def _array(values: Any, kind: Any, width: int = 0) -> Array:
+def _to_array(values: Any, kind: Any, width: int = 0) -> Array:
     """Return values as an array (N,), or (N, width); empty for None."""
     array = np.asarray([] if values is None else values, dtype=kind)
     return array.reshape(-1, width) if width else array
 
 
-def _smooth(points: Array, faces: Array) -> Array:
+def _compute_smooth_normals(points: Array, faces: Array) -> Array:
     """Return normals (P, 3) of points: the area-weighted mean of their triangles'."""
-    vectors = reading.face_vectors(points[faces])
+    vectors = reading.compute_area_vectors(points[faces])
     normals = np.zeros_like(points)
     for corner in range(3):
         np.add.at(normals, faces[:, corner], vectors)

@@ -22,17 +22,17 @@ from PIL import Image
 from pxr import Ar, Usd, UsdShade
 
 from advsearch.extend import color, errors, reading, stored_files
-from advsearch.scene.importing.usd.layers import read_packaged, shorten
+from advsearch.scene.importing.usd.layers import format_error, read_packaged
 from advsearch.scene.importing.usd.pictures import (
     EXR,
-    decode_picture,
+    decode_image,
     has_colors_of_8_bits,
     is_marked_srgb,
     is_of_8_bits,
 )
 
 Array = npt.NDArray[Any]
-FIRST = Usd.TimeCode.EarliestTime()
+FIRST_TIME = Usd.TimeCode.EarliestTime()
 PREVIEW_SURFACE = "UsdPreviewSurface"
 UV_TEXTURE = "UsdUVTexture"
 TRANSFORM = "UsdTransform2d"
@@ -40,9 +40,9 @@ READERS_OF_COORDINATES = ("UsdPrimvarReader_float2", "UsdPrimvarReader_vector")
 READERS_OF_COLORS = ("UsdPrimvarReader_float3", "UsdPrimvarReader_float4")
 READER_OF_NUMBERS = "UsdPrimvarReader_float"
 # Defaults of a preview surface; the color is linear.
-GREY = (0.18, 0.18, 0.18)
-ROUGHNESS = 0.5
-WRAPS = {
+DEFAULT_COLOR = (0.18, 0.18, 0.18)
+DEFAULT_ROUGHNESS = 0.5
+WRAP_MODES = {
     "repeat": reading.gltf_entries.REPEAT,
     "mirror": reading.gltf_entries.MIRRORED,
     "clamp": reading.gltf_entries.CLAMPED,
@@ -60,16 +60,16 @@ NORMAL_SCALE = (2.0, 2.0, 2.0, 1.0)
 NORMAL_BIAS = (-1.0, -1.0, -1.0, 0.0)
 """Scale and bias that convert texels of 8 bits to normals."""
 UPRIGHT = (0.0, 0.0, 1.0)  # default normal of a surface
-WITHOUT_EFFECT: Mapping[str, float | tuple[float, ...]] = {
+NEUTRAL_VALUES: Mapping[str, float | tuple[float, ...]] = {
     **{"clearcoat": 0.0, "displacement": 0.0, "occlusion": 1.0, "ior": 1.5},
     **{"specularColor": (0.0, 0.0, 0.0)},
 }
 """Values of inputs that change nothing: they need no note if they are not read."""
-MOST_NODES = 32  # limit of the shaders in a row
+MAX_SHADERS = 32  # limit of the shaders in a row
 
 
 @dataclass(frozen=True)
-class Layout:
+class TextureLayout:
     """The texture coordinates of an image: a primvar and its transform."""
 
     primvar: str = "st"  # empty: the same texture coordinates everywhere
@@ -77,7 +77,7 @@ class Layout:
     fallback: tuple[float, float] | None = None
     matrix: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # two rows for (s, t, 1)
 
-    def moved(self, st: Array) -> Array:
+    def transform(self, st: Array) -> Array:
         """Return texture coordinates (N, 2) after the transform."""
         rows = np.array(self.matrix).reshape(2, 3)
         return np.asarray(st @ rows[:, :2].T + rows[:, 2])
@@ -95,9 +95,9 @@ class PrimvarUse:
 class BoundMaterial:
     """The material of some faces."""
 
-    number: int  # index of the glTF material
+    index: int  # index of the glTF material
     # Texture coordinates by their index in glTF.
-    layouts: tuple[Layout, ...] = (Layout(),)
+    layouts: tuple[TextureLayout, ...] = (TextureLayout(),)
     color: PrimvarUse | None = None
     opacity: PrimvarUse | None = None
     is_default: bool = False  # whether the prim has no material
@@ -111,7 +111,7 @@ class Shader:
     inputs: reading.TrackedKeys[Any]
 
     @classmethod
-    def of(cls, prim: Any) -> Shader:
+    def from_prim(cls, prim: Any) -> Shader:
         """Return the shader of a prim."""
         inputs = {
             shader_input.GetBaseName(): shader_input
@@ -124,7 +124,7 @@ class Shader:
         """The id of the shader, such as UsdUVTexture."""
         return str(self.prim.GetIdAttr().Get() or "a shader without an id")
 
-    def _producers(self, name: str) -> Sequence[Any]:
+    def _find_producers(self, name: str) -> Sequence[Any]:
         """Return the attributes that produce the value of an input."""
         shader_input = self.inputs.get(name)
         if not shader_input:
@@ -134,37 +134,40 @@ class Shader:
         )
         return producers
 
-    def source(self, name: str) -> tuple[Shader, str] | None:
+    def find_source(self, name: str) -> tuple[Shader, str] | None:
         """Return the shader, and its output, that an input is connected to, or None."""
-        for attribute in self._producers(name):
+        for attribute in self._find_producers(name):
             prim = UsdShade.Shader(attribute.GetPrim())
             if prim and _is_output(attribute):
                 output, _ = UsdShade.Utils.GetBaseNameAndType(attribute.GetName())
-                return Shader.of(prim), output
+                return Shader.from_prim(prim), output
         return None
 
-    def value(self, name: str) -> Any:
+    def get_value(self, name: str) -> Any:
         """Return the value of an input; None if it has none, or is connected."""
-        if self.source(name) is not None:
+        if self.find_source(name) is not None:
             return None
-        return next((attribute.Get(FIRST) for attribute in self._producers(name)), None)
+        return next(
+            (attribute.Get(FIRST_TIME) for attribute in self._find_producers(name)),
+            None,
+        )
 
-    def numbers(self, name: str, otherwise: Sequence[float]) -> tuple[float, ...]:
-        """Return the finite numbers of an input, or `otherwise`, which has as many."""
-        value = self.value(name)
+    def get_numbers(self, name: str, default: Sequence[float]) -> tuple[float, ...]:
+        """Return the finite numbers of an input, or `default`, which has as many."""
+        value = self.get_value(name)
         if value is None:
-            return tuple(otherwise)
+            return tuple(default)
         try:
-            numbers = np.array(value, np.float64).reshape(-1)[: len(otherwise)]
+            numbers = np.array(value, np.float64).reshape(-1)[: len(default)]
         except (TypeError, ValueError):
-            return tuple(otherwise)
-        if len(numbers) < len(otherwise) or not np.isfinite(numbers).all():
-            return tuple(otherwise)
+            return tuple(default)
+        if len(numbers) < len(default) or not np.isfinite(numbers).all():
+            return tuple(default)
         return tuple(map(float, numbers))
 
-    def number(self, name: str, otherwise: float) -> float:
-        """Return the finite number of an input, or `otherwise`."""
-        return self.numbers(name, (otherwise,))[0]
+    def get_number(self, name: str, default: float) -> float:
+        """Return the finite number of an input, or `default`."""
+        return self.get_numbers(name, (default,))[0]
 
 
 def _is_output(attribute: Any) -> bool:
@@ -182,7 +185,7 @@ class UsdTextureUse:
     channels: Sequence[int]
     scale: tuple[float, ...]
     bias: tuple[float, ...]
-    layout: Layout
+    layout: TextureLayout
     wraps: tuple[int, int]
 
     @property
@@ -202,15 +205,15 @@ class UsdSurfaces:
     folder: Path
     header: dict[str, Any]
     buffer: reading.GlbBuffer
-    left: Counter[str]  # notes on what is left out
-    read: list[str]  # files that were read
-    _bound: dict[str, BoundMaterial] = field(default_factory=dict)
+    note_counts: Counter[str]  # notes on what is left out
+    files_read: list[str]  # files that were read
+    _materials: dict[str, BoundMaterial] = field(default_factory=dict)
     _texels: dict[tuple[bytes, bool], Array] = field(default_factory=dict)
 
-    def leave(self, what: str) -> None:
-        self.left[what] += 1
+    def note(self, what: str) -> None:
+        self.note_counts[what] += 1
 
-    def bound_to(self, prim: Any) -> BoundMaterial:
+    def find_material(self, prim: Any) -> BoundMaterial:
         """Return the material of a prim, or its display color."""
         binding = UsdShade.MaterialBindingAPI(prim)
         material = (
@@ -218,22 +221,22 @@ class UsdSurfaces:
             or binding.ComputeBoundMaterial()[0]
         )
         path = str(material.GetPath()) if material else ""
-        if path not in self._bound:
-            self._bound[path] = (
-                self._convert(material) if material else self._without_material()
+        if path not in self._materials:
+            self._materials[path] = (
+                self._convert(material) if material else self._make_default_material()
             )
-        return self._bound[path]
+        return self._materials[path]
 
-    def _without_material(self) -> BoundMaterial:
+    def _make_default_material(self) -> BoundMaterial:
         surface = {
-            "baseColorFactor": [*GREY, 1.0],
+            "baseColorFactor": [*DEFAULT_COLOR, 1.0],
             "metallicFactor": 0.0,
-            "roughnessFactor": ROUGHNESS,
+            "roughnessFactor": DEFAULT_ROUGHNESS,
         }
         number = self._add_material(
             {"name": "displayColor", "pbrMetallicRoughness": surface}
         )
-        color = PrimvarUse("displayColor", GREY)
+        color = PrimvarUse("displayColor", DEFAULT_COLOR)
         return BoundMaterial(
             number,
             color=color,
@@ -245,14 +248,14 @@ class UsdSurfaces:
         self.header["materials"].append({**entry, "doubleSided": True})
         return len(self.header["materials"]) - 1
 
-    def tinted(
+    def make_tinted(
         self, bound: BoundMaterial, color: Sequence[float] | None, opacity: float | None
     ) -> int:
         """Return the index of a material with another color and opacity.
 
         Both are linear values, clipped to [0, 1]; None leaves them as they are.
         """
-        entry = dict(self.header["materials"][bound.number])
+        entry = dict(self.header["materials"][bound.index])
         surface = dict(entry["pbrMetallicRoughness"])
         factor = list(surface["baseColorFactor"])
         if color is not None:
@@ -262,30 +265,28 @@ class UsdSurfaces:
         entry["pbrMetallicRoughness"] = {**surface, "baseColorFactor": factor}
         if factor[3] < 1.0 and "alphaMode" not in entry:
             entry["alphaMode"] = "BLEND"
-        return self._numbered("materials", entry)
+        return self._find_or_add("materials", entry)
 
     def _convert(self, material: Any) -> BoundMaterial:
         name = str(material.GetPrim().GetName())
         self._texels.clear()  # they take memory
         shader = material.ComputeSurfaceSource()[0]
         if not shader or shader.GetIdAttr().Get() != PREVIEW_SURFACE:
-            self.leave(
-                "has a material that is no UsdPreviewSurface, which is grey here"
-            )
+            self.note("has a material that is no UsdPreviewSurface, which is grey here")
             grey = [0.2140, 0.2140, 0.2140, 1.0]
             surface = {
                 "baseColorFactor": grey,
                 "metallicFactor": 0.0,
-                "roughnessFactor": ROUGHNESS,
+                "roughnessFactor": DEFAULT_ROUGHNESS,
             }
             return BoundMaterial(
                 self._add_material({"name": name, "pbrMetallicRoughness": surface})
             )
-        return PreviewSurface(self, Shader.of(shader), name).convert()
+        return PreviewSurface(self, Shader.from_prim(shader), name).convert()
 
     # ---- Images ----
 
-    def image(self, asset: Any, name: str) -> bytes | None:
+    def load_image(self, asset: Any, name: str) -> bytes | None:
         """Return the bytes of an image in the folder; None, and a note, if it is missing.
 
         Args:
@@ -309,12 +310,12 @@ class UsdSurfaces:
                 )
         if data is None:
             reason = reading.MISSING if is_in_folder else reading.OUTSIDE
-            self.leave(f"the texture {path[:100]!r} of {name} {reason}")
+            self.note(f"the texture {path[:100]!r} of {name} {reason}")
             return None
-        self.read.append(outer)
+        self.files_read.append(outer)
         return data
 
-    def texels(self, use: UsdTextureUse) -> Array | None:
+    def load_texels(self, use: UsdTextureUse) -> Array | None:
         """Return an image (H, W, 4) in linear values, before scale and bias.
 
         None, and a note, if it cannot be decoded.
@@ -322,7 +323,7 @@ class UsdSurfaces:
         key = (use.data, use.is_srgb)
         if key not in self._texels:
             try:
-                self._texels[key] = decode_picture(
+                self._texels[key] = decode_image(
                     use.data, use.path, is_srgb=use.is_srgb
                 )
             except (
@@ -332,22 +333,22 @@ class UsdSurfaces:
                 EOFError,
                 errors.FileFormatError,
             ) as error:
-                self.leave(
-                    f"the texture {use.path[:100]!r} cannot be read ({shorten(error)})"
+                self.note(
+                    f"the texture {use.path[:100]!r} cannot be read ({format_error(error)})"
                 )
                 return None
         return self._texels[key]
 
-    def values(self, use: UsdTextureUse) -> Array | None:
+    def compute_values(self, use: UsdTextureUse) -> Array | None:
         """Return what an image yields after scale and bias, (H, W, C), or None."""
-        texels = self.texels(use)
+        texels = self.load_texels(use)
         if texels is None:
             return None
         scale = np.array(use.scale, np.float32)
         bias = np.array(use.bias, np.float32)
         return np.asarray((texels * scale + bias)[:, :, list(use.channels)])
 
-    def add_picture(self, levels: Array, sampler: Mapping[str, int]) -> int:
+    def add_image(self, levels: Array, sampler: Mapping[str, int]) -> int:
         """Add an image of display values in [0, 1], (H, W, 3 or 4).
 
         Returns the index of its texture.
@@ -360,16 +361,16 @@ class UsdSurfaces:
     def add_texture(self, data: bytes, sampler: Mapping[str, int]) -> int:
         """Add an image file with a sampler, and return the index of its texture."""
         entry = {
-            "mimeType": reading.mime_type(data),
-            "bufferView": self.buffer.view(data),
+            "mimeType": reading.find_mime_type(data),
+            "bufferView": self.buffer.add_view(data),
         }
-        image = self._numbered("images", entry)
-        return self._numbered(
+        image = self._find_or_add("images", entry)
+        return self._find_or_add(
             "textures",
-            {"source": image, "sampler": self._numbered("samplers", sampler)},
+            {"source": image, "sampler": self._find_or_add("samplers", sampler)},
         )
 
-    def _numbered(self, kind: str, entry: Mapping[str, Any]) -> int:
+    def _find_or_add(self, kind: str, entry: Mapping[str, Any]) -> int:
         """Return the index of an entry of the header, which is added if it is new."""
         entries: list[Mapping[str, Any]] = self.header[kind]
         if entry not in entries:
@@ -384,62 +385,64 @@ class PreviewSurface:
     surfaces: UsdSurfaces
     shader: Shader
     name: str
-    layouts: list[Layout] = field(default_factory=list)
+    layouts: list[TextureLayout] = field(default_factory=list)
     # Shaders that are read, by path.
     nodes: dict[str, Shader] = field(default_factory=dict)
 
     def convert(self) -> BoundMaterial:
         """Write the material, and note the inputs that are not read."""
         shader = self.shader
-        is_specular = bool(shader.number("useSpecularWorkflow", 0.0))
+        is_specular = bool(shader.get_number("useSpecularWorkflow", 0.0))
         surface: dict[str, Any] = {}
         entry: dict[str, Any] = {"name": self.name, "pbrMetallicRoughness": surface}
-        color, opacity = self._base(entry, surface)
-        self._numbers(surface, is_specular=is_specular)
-        self._normal(entry)
-        self._emission(entry)
+        color, opacity = self._add_base(entry, surface)
+        self._add_roughness_and_metallic(surface, is_specular=is_specular)
+        self._add_normal(entry)
+        self._add_emission(entry)
         if is_specular:
-            self.surfaces.leave(
+            self.surfaces.note(
                 "has materials with a specular workflow, of which the "
                 "diffuse colour is read"
             )
         shader.inputs.mark_read("clearcoatRoughness")  # named with the clearcoat
         if (
-            str(shader.value("opacityMode") or "presence") != "presence"
+            str(shader.get_value("opacityMode") or "presence") != "presence"
             and entry.get("alphaMode") == "BLEND"
         ):
-            self.surfaces.leave(
+            self.surfaces.note(
                 "has materials with opacityMode transparent; here "
                 "highlights fade with the opacity too"
             )
-        self._name_unread(is_specular=is_specular)
+        self._note_unread(is_specular=is_specular)
         number = self.surfaces._add_material(entry)
-        return BoundMaterial(number, tuple(self.layouts) or (Layout(),), color, opacity)
+        return BoundMaterial(
+            number, tuple(self.layouts) or (TextureLayout(),), color, opacity
+        )
 
-    def _name_unread(self, *, is_specular: bool) -> None:
+    def _note_unread(self, *, is_specular: bool) -> None:
         """Note the inputs that are not read, of the surface and of its shaders."""
 
         def is_quiet(name: str, shader_input: Any) -> bool:
             if name == "specularColor" and not is_specular:
                 return True
-            neutral = WITHOUT_EFFECT.get(name)
+            neutral = NEUTRAL_VALUES.get(name)
             for attribute in UsdShade.Utils.GetValueProducingAttributes(shader_input):
                 if _is_output(attribute) or neutral is None:
                     return False
-                value = attribute.Get(FIRST)
+                value = attribute.Get(FIRST_TIME)
                 if value is not None and not np.allclose(
                     np.array(value, np.float64), neutral, atol=1e-3
                 ):
                     return False
             return True
 
-        for name in self.shader.inputs.unread(is_quiet):
+        for name in self.shader.inputs.find_unread(is_quiet):
             label = "an ior other than 1.5" if name == "ior" else name
-            self.surfaces.leave(f"has materials with {label[:100]}, which is left out")
+            self.surfaces.note(f"has materials with {label[:100]}, which is left out")
         for node in self.nodes.values():
-            unread = node.inputs.unread()
+            unread = node.inputs.find_unread()
             if unread:
-                self.surfaces.leave(
+                self.surfaces.note(
                     f"has a {node.kind[:50]} with "
                     f"{reading.join_names(unread, 5)}, which is not "
                     "read"
@@ -447,52 +450,52 @@ class PreviewSurface:
 
     # ---- Connections of inputs ----
 
-    def _node(self, source: Shader) -> Shader:
+    def _track_shader(self, source: Shader) -> Shader:
         """Return the shader that stands for a prim, the same one each time."""
         return self.nodes.setdefault(str(source.prim.GetPath()), source)
 
-    def _primvar(
-        self, name: str, kinds: Sequence[str], otherwise: tuple[float, ...]
+    def _find_primvar(
+        self, name: str, kinds: Sequence[str], default: tuple[float, ...]
     ) -> PrimvarUse | None:
         """Return the primvar that an input is connected to, or None.
 
         Args:
             name: the input.
             kinds: ids of the readers of primvars that count.
-            otherwise: the default of the input, for its number of channels.
+            default: the default of the input, for its number of channels.
         """
-        source = self.shader.source(name)
+        source = self.shader.find_source(name)
         if source is None or source[0].kind not in kinds:
             return None
-        reader = self._node(source[0])
-        primvar = str(reader.value("varname") or "")
-        return PrimvarUse(primvar, reader.numbers("fallback", [0.0] * len(otherwise)))
+        reader = self._track_shader(source[0])
+        primvar = str(reader.get_value("varname") or "")
+        return PrimvarUse(primvar, reader.get_numbers("fallback", [0.0] * len(default)))
 
-    def _texture(self, name: str) -> UsdTextureUse | tuple[float, ...] | None:
+    def _find_texture(self, name: str) -> UsdTextureUse | tuple[float, ...] | None:
         """Return the texture that an input is connected to.
 
         Returns:
             The texture; or the numbers, one for each channel, that stand in for an image
             that is missing; or None.
         """
-        source = self.shader.source(name)
+        source = self.shader.find_source(name)
         if source is None:
             return None
-        node = self._node(source[0])
+        node = self._track_shader(source[0])
         output = source[1]
-        leave = self.surfaces.leave
+        leave = self.surfaces.note
         if node.kind != UV_TEXTURE:
             leave(f"has a {name} of {node.kind[:100]}, which is left out")
             return None
         fallback = None
-        if node.value("fallback") is not None:
-            fallback = node.numbers("fallback", NO_SCALE)
-        scale = node.numbers("scale", NO_SCALE)
-        bias = node.numbers("bias", NO_BIAS)
-        layout = self._layout(node)
-        wraps = self._wraps(node)
-        color_space = str(node.value("sourceColorSpace") or "auto")
-        asset = node.value("file")
+        if node.get_value("fallback") is not None:
+            fallback = node.get_numbers("fallback", NO_SCALE)
+        scale = node.get_numbers("scale", NO_SCALE)
+        bias = node.get_numbers("bias", NO_BIAS)
+        layout = self._find_layout(node)
+        wraps = self._read_wraps(node)
+        color_space = str(node.get_value("sourceColorSpace") or "auto")
+        asset = node.get_value("file")
         if output not in CHANNELS:
             leave(
                 f"has a {name} of the output {output[:50]!r} of a picture, which is "
@@ -501,7 +504,7 @@ class PreviewSurface:
             return None
         channels = CHANNELS[output]
         path = "" if asset is None else str(asset.path)
-        data = self._image(asset, path, name)
+        data = self._load_image(asset, path, name)
         if data is None:
             if fallback is None:
                 return None
@@ -519,77 +522,79 @@ class PreviewSurface:
             is_srgb = is_marked_srgb(data)
         return UsdTextureUse(path, data, is_srgb, channels, scale, bias, layout, wraps)
 
-    def _image(self, asset: Any, path: str, name: str) -> bytes | None:
+    def _load_image(self, asset: Any, path: str, name: str) -> bytes | None:
         """Return the bytes of the image of an input; None, and a note, if there is none."""
         if "<UDIM>" in path:
-            self.surfaces.leave(
+            self.surfaces.note(
                 "has UDIM textures, which are left out; make .obj or one texture of "
                 "them"
             )
             return None
         if not path:
-            self.surfaces.leave(f"has a {name} of a picture without a file")
+            self.surfaces.note(f"has a {name} of a picture without a file")
             return None
-        return self.surfaces.image(asset, self.name)
+        return self.surfaces.load_image(asset, self.name)
 
-    def _wraps(self, node: Shader) -> tuple[int, int]:
+    def _read_wraps(self, node: Shader) -> tuple[int, int]:
         """Return the wrap modes of a texture along s and t, as in glTF."""
         wraps = []
         for axis in ("wrapS", "wrapT"):
-            mode = str(node.value(axis) or "useMetadata")
-            if mode not in WRAPS:
-                self.surfaces.leave(
+            mode = str(node.get_value(axis) or "useMetadata")
+            if mode not in WRAP_MODES:
+                self.surfaces.note(
                     f"has a texture with the {axis} {mode[:50]!r}, "
                     "which is taken for repeat"
                 )
-            wraps.append(WRAPS.get(mode, reading.gltf_entries.REPEAT))
+            wraps.append(WRAP_MODES.get(mode, reading.gltf_entries.REPEAT))
         return wraps[0], wraps[1]
 
-    def _layout(self, node: Shader) -> Layout:
+    def _find_layout(self, node: Shader) -> TextureLayout:
         """Return the texture coordinates of a texture: a primvar and its transforms."""
         matrix = np.eye(3)
         name = "st"
-        for _ in range(MOST_NODES):
-            source = node.source(name)
+        for _ in range(MAX_SHADERS):
+            source = node.find_source(name)
             if source is None:
-                return self._constant_layout(node, name, matrix)
-            node = self._node(source[0])
+                return self._make_constant_layout(node, name, matrix)
+            node = self._track_shader(source[0])
             rows = tuple(map(float, matrix[:2].ravel()))
             if node.kind == TRANSFORM:
-                matrix = matrix @ _transform_of(node)
+                matrix = matrix @ _compute_transform(node)
                 name = "in"
             elif node.kind in READERS_OF_COORDINATES:
-                primvar = str(node.value("varname") or "st")
-                fallback = node.numbers("fallback", (0.0, 0.0))
-                return Layout(primvar, (fallback[0], fallback[1]), rows)
+                primvar = str(node.get_value("varname") or "st")
+                fallback = node.get_numbers("fallback", (0.0, 0.0))
+                return TextureLayout(primvar, (fallback[0], fallback[1]), rows)
             else:
-                self.surfaces.leave(
+                self.surfaces.note(
                     "has a texture that is looked up by "
                     f"{node.kind[:100]}; st is taken for it"
                 )
-                return Layout("st", None, rows)
+                return TextureLayout("st", None, rows)
         raise errors.FileFormatError(
-            f"the material {self.name}: expected at most {MOST_NODES} shaders in a "
+            f"the material {self.name}: expected at most {MAX_SHADERS} shaders in a "
             "row, got more"
         )
 
-    def _constant_layout(self, node: Shader, name: str, matrix: Array) -> Layout:
-        self.surfaces.leave(
+    def _make_constant_layout(
+        self, node: Shader, name: str, matrix: Array
+    ) -> TextureLayout:
+        self.surfaces.note(
             "has a texture without texture coordinates (st), of which "
             "one texel is shown"
         )
-        s, t = node.numbers(name, (0.0, 0.0))
+        s, t = node.get_numbers(name, (0.0, 0.0))
         u, v, _ = matrix @ np.array([s, t, 1.0])
-        return Layout("", (0.0, 0.0), (0.0, 0.0, float(u), 0.0, 0.0, float(v)))
+        return TextureLayout("", (0.0, 0.0), (0.0, 0.0, float(u), 0.0, 0.0, float(v)))
 
-    def _slot(self, texture: int, layout: Layout) -> dict[str, int]:
+    def _make_slot(self, texture: int, layout: TextureLayout) -> dict[str, int]:
         if layout not in self.layouts:
             self.layouts.append(layout)
         return {"index": texture, "texCoord": self.layouts.index(layout)}
 
     # ---- Properties of the material ----
 
-    def _base(
+    def _add_base(
         self, entry: dict[str, Any], surface: dict[str, Any]
     ) -> tuple[PrimvarUse | None, PrimvarUse | None]:
         """Fill in color and opacity.
@@ -602,13 +607,15 @@ class PreviewSurface:
             The primvars that replace color and opacity.
         """
         shader = self.shader
-        color_primvar = self._primvar("diffuseColor", READERS_OF_COLORS, GREY)
-        opacity_primvar = self._primvar("opacity", (READER_OF_NUMBERS,), (1.0,))
-        color_use = None if color_primvar else self._texture("diffuseColor")
-        opacity_use = None if opacity_primvar else self._texture("opacity")
-        threshold = shader.number("opacityThreshold", 0.0)
-        color = list(shader.numbers("diffuseColor", GREY))
-        opacity = shader.number("opacity", 1.0)
+        color_primvar = self._find_primvar(
+            "diffuseColor", READERS_OF_COLORS, DEFAULT_COLOR
+        )
+        opacity_primvar = self._find_primvar("opacity", (READER_OF_NUMBERS,), (1.0,))
+        color_use = None if color_primvar else self._find_texture("diffuseColor")
+        opacity_use = None if opacity_primvar else self._find_texture("opacity")
+        threshold = shader.get_number("opacityThreshold", 0.0)
+        color = list(shader.get_numbers("diffuseColor", DEFAULT_COLOR))
+        opacity = shader.get_number("opacity", 1.0)
         if isinstance(color_use, tuple):
             color = list(np.broadcast_to(color_use, 3))
             color_use = None
@@ -620,16 +627,16 @@ class PreviewSurface:
             and color_use is not None
             and opacity_use.layout != color_use.layout
         ):
-            self.surfaces.leave(
+            self.surfaces.note(
                 "has an opacity with other texture coordinates than the "
                 "colour's, which is left out"
             )
             opacity_use = None
-        texture, color = self._base_texture(color_use, opacity_use, color)
+        texture, color = self._add_base_texture(color_use, opacity_use, color)
         if texture is not None:
             first_use = color_use or opacity_use
             assert first_use is not None
-            surface["baseColorTexture"] = self._slot(texture, first_use.layout)
+            surface["baseColorTexture"] = self._make_slot(texture, first_use.layout)
         has_opacity_map = texture is not None and opacity_use is not None
         alpha = 1.0 if has_opacity_map else opacity
         factor = [min(max(channel, 0.0), 1.0) for channel in (*color, alpha)]
@@ -641,7 +648,7 @@ class PreviewSurface:
                 entry["alphaMode"] = "BLEND"
         return color_primvar, opacity_primvar
 
-    def _base_texture(
+    def _add_base_texture(
         self,
         color_use: UsdTextureUse | None,
         opacity_use: UsdTextureUse | None,
@@ -656,18 +663,18 @@ class PreviewSurface:
         if first_use is None:
             return None, color
         is_alpha_of_color = opacity_use is None or (
-            color_use is not None and _is_its_alpha(opacity_use, color_use)
+            color_use is not None and _is_alpha_of(opacity_use, color_use)
         )
-        if color_use is not None and _is_factor(color_use) and is_alpha_of_color:
+        if color_use is not None and _is_scaled_texel(color_use) and is_alpha_of_color:
             texture = self.surfaces.add_texture(color_use.data, color_use.sampler)
             return texture, list(color_use.scale[:3])
-        levels = self._baked(color_use, opacity_use, color)
+        levels = self._bake(color_use, opacity_use, color)
         if levels is None:
             return None, color
-        texture = self.surfaces.add_picture(levels, first_use.sampler)
+        texture = self.surfaces.add_image(levels, first_use.sampler)
         return texture, [1.0, 1.0, 1.0]
 
-    def _baked(
+    def _bake(
         self,
         color_use: UsdTextureUse | None,
         opacity_use: UsdTextureUse | None,
@@ -677,8 +684,10 @@ class PreviewSurface:
 
         None if neither image can be read. `factor` is the color if it has no image.
         """
-        colors = None if color_use is None else self.surfaces.values(color_use)
-        opacities = None if opacity_use is None else self.surfaces.values(opacity_use)
+        colors = None if color_use is None else self.surfaces.compute_values(color_use)
+        opacities = (
+            None if opacity_use is None else self.surfaces.compute_values(opacity_use)
+        )
         if colors is None:
             if opacities is None:
                 return None
@@ -693,40 +702,42 @@ class PreviewSurface:
         if opacities.shape[:2] != levels.shape[:2]:
             width = max(opacities.shape[1], levels.shape[1])
             height = max(opacities.shape[0], levels.shape[0])
-            opacities = _resized(opacities, (width, height))
-            levels = _resized(levels, (width, height))
+            opacities = _resize(opacities, (width, height))
+            levels = _resize(levels, (width, height))
         return np.concatenate([levels, opacities[:, :, :1]], axis=2)
 
-    def _numbers(self, surface: dict[str, Any], *, is_specular: bool) -> None:
+    def _add_roughness_and_metallic(
+        self, surface: dict[str, Any], *, is_specular: bool
+    ) -> None:
         """Fill in roughness and metallic; their images are packed into one."""
         factors = {
-            "roughness": self.shader.number("roughness", ROUGHNESS),
-            "metallic": self.shader.number("metallic", 0.0),
+            "roughness": self.shader.get_number("roughness", DEFAULT_ROUGHNESS),
+            "metallic": self.shader.get_number("metallic", 0.0),
         }
         planes: dict[str, Array] = {}
         first_use: UsdTextureUse | None = None
         for name in factors:
-            primvar = self._primvar(name, (READER_OF_NUMBERS,), (0.0,))
+            primvar = self._find_primvar(name, (READER_OF_NUMBERS,), (0.0,))
             if primvar is not None:
                 factors[name] = primvar.fallback[0]
-                self.surfaces.leave(
+                self.surfaces.note(
                     f"has a {name} of the primvar "
                     f"{primvar.name[:50]!r}, of which the fallback is "
                     "read"
                 )
                 continue
-            use = self._texture(name)
+            use = self._find_texture(name)
             if isinstance(use, tuple):
                 factors[name] = use[0]
                 continue
-            values = None if use is None else self.surfaces.values(use)
+            values = None if use is None else self.surfaces.compute_values(use)
             if use is None or values is None:
                 continue
-            self._name_srgb(name, use)
+            self._note_srgb(name, use)
             plane = np.clip(values[:, :, 0], 0.0, 1.0)
             if first_use is not None and use.layout != first_use.layout:
                 factors[name] = float(plane.mean())
-                self.surfaces.leave(
+                self.surfaces.note(
                     f"has a {name} with other texture coordinates, "
                     "of which the mean is read"
                 )
@@ -740,43 +751,43 @@ class PreviewSurface:
             surface["metallicFactor"] = factors["metallic"]
             surface["roughnessFactor"] = factors["roughness"]
             return
-        texture = self.surfaces.add_picture(
+        texture = self.surfaces.add_image(
             _pack_planes(planes, factors), first_use.sampler
         )
         surface["metallicFactor"] = 1.0
         surface["roughnessFactor"] = 1.0
-        surface["metallicRoughnessTexture"] = self._slot(texture, first_use.layout)
+        surface["metallicRoughnessTexture"] = self._make_slot(texture, first_use.layout)
 
-    def _name_srgb(self, name: str, use: UsdTextureUse) -> None:
+    def _note_srgb(self, name: str, use: UsdTextureUse) -> None:
         if use.is_srgb and use.channels != CHANNELS["a"]:
-            self.surfaces.leave(
+            self.surfaces.note(
                 f"has a {name} that is decoded from sRGB, as its sourceColorSpace "
                 "says; write raw if it holds numbers"
             )
 
-    def _normal(self, entry: dict[str, Any]) -> None:
-        if self.shader.source("normal") is None:
+    def _add_normal(self, entry: dict[str, Any]) -> None:
+        if self.shader.find_source("normal") is None:
             if not np.allclose(
-                self.shader.numbers("normal", UPRIGHT), UPRIGHT, atol=1e-3
+                self.shader.get_numbers("normal", UPRIGHT), UPRIGHT, atol=1e-3
             ):
-                self.surfaces.leave(
+                self.surfaces.note(
                     "has materials with one normal everywhere, which is left out"
                 )
             return
-        use = self._texture("normal")
+        use = self._find_texture("normal")
         if isinstance(use, tuple) or use is None:
             return
         if len(use.channels) != 3:
-            self.surfaces.leave(
+            self.surfaces.note(
                 "has a normal of one channel of a picture, which is left out"
             )
             return
         # USD requires scale and bias, which many exporters leave out.
         if use.is_plain and is_of_8_bits(use.data):
-            texels = self.surfaces.texels(replace(use, is_srgb=False))
-            if texels is not None and reading.holds_normals(texels[:, :, :3]):
+            texels = self.surfaces.load_texels(replace(use, is_srgb=False))
+            if texels is not None and reading.has_normals(texels[:, :, :3]):
                 use = replace(use, scale=NORMAL_SCALE, bias=NORMAL_BIAS, is_srgb=False)
-                self.surfaces.leave(
+                self.surfaces.note(
                     "has a normal map of 8 bits without scale (2, 2, 2, 1) and bias "
                     "(-1, -1, -1, 0), which are added"
                 )
@@ -786,28 +797,30 @@ class PreviewSurface:
             and use.bias[:3] == NORMAL_BIAS[:3]
         ):
             if is_of_8_bits(use.data):
-                entry["normalTexture"] = self._slot(
+                entry["normalTexture"] = self._make_slot(
                     self.surfaces.add_texture(use.data, use.sampler), use.layout
                 )
                 return
-        self._name_srgb("normal", use)
-        normals = self.surfaces.values(use)
+        self._note_srgb("normal", use)
+        normals = self.surfaces.compute_values(use)
         if normals is not None:
-            texture = self.surfaces.add_picture(normals * 0.5 + 0.5, use.sampler)
-            entry["normalTexture"] = self._slot(texture, use.layout)
+            texture = self.surfaces.add_image(normals * 0.5 + 0.5, use.sampler)
+            entry["normalTexture"] = self._make_slot(texture, use.layout)
 
-    def _emission(self, entry: dict[str, Any]) -> None:
+    def _add_emission(self, entry: dict[str, Any]) -> None:
         """Fill in the emission, whose factor may be larger than 1."""
-        factor: Sequence[float] = self.shader.numbers("emissiveColor", (0.0, 0.0, 0.0))
-        use = self._texture("emissiveColor")
+        factor: Sequence[float] = self.shader.get_numbers(
+            "emissiveColor", (0.0, 0.0, 0.0)
+        )
+        use = self._find_texture("emissiveColor")
         if isinstance(use, tuple):
             factor = list(np.broadcast_to(use, 3))
-        elif use is not None and _is_factor(use, most=math.inf):
+        elif use is not None and _is_scaled_texel(use, max_scale=math.inf):
             texture = self.surfaces.add_texture(use.data, use.sampler)
-            entry["emissiveTexture"] = self._slot(texture, use.layout)
+            entry["emissiveTexture"] = self._make_slot(texture, use.layout)
             factor = use.scale[:3]
         elif use is not None:
-            values = self.surfaces.values(use)
+            values = self.surfaces.compute_values(use)
             if values is None:
                 return
             values = np.broadcast_to(
@@ -815,8 +828,8 @@ class PreviewSurface:
             )
             largest = max(float(values.max()), 1e-6)
             levels = color.linear_to_srgb((values / largest).astype(np.float32))
-            texture = self.surfaces.add_picture(levels, use.sampler)
-            entry["emissiveTexture"] = self._slot(texture, use.layout)
+            texture = self.surfaces.add_image(levels, use.sampler)
+            entry["emissiveTexture"] = self._make_slot(texture, use.layout)
             factor = [largest] * 3
         factor = [max(channel, 0.0) for channel in factor]
         strength = max(factor)
@@ -840,15 +853,15 @@ def _pack_planes(planes: Mapping[str, Array], factors: Mapping[str, float]) -> A
     for channel, name in ((1, "roughness"), (2, "metallic")):
         packed[:, :, channel] = min(max(factors[name], 0.0), 1.0)
         if name in planes:
-            packed[:, :, channel] = _resized(planes[name], (width, height))
+            packed[:, :, channel] = _resize(planes[name], (width, height))
     return packed
 
 
-def _transform_of(node: Shader) -> Array:
+def _compute_transform(node: Shader) -> Array:
     """Return the matrix (3, 3) of a UsdTransform2d: scale, then rotate, then translate."""
-    scale = node.numbers("scale", (1.0, 1.0))
-    shift = node.numbers("translation", (0.0, 0.0))
-    angle = math.radians(node.number("rotation", 0.0))
+    scale = node.get_numbers("scale", (1.0, 1.0))
+    shift = node.get_numbers("translation", (0.0, 0.0))
+    angle = math.radians(node.get_number("rotation", 0.0))
     rotation = np.array(
         [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     )
@@ -858,17 +871,17 @@ def _transform_of(node: Shader) -> Array:
     return matrix
 
 
-def _is_factor(use: UsdTextureUse, most: float = 1.0) -> bool:
+def _is_scaled_texel(use: UsdTextureUse, max_scale: float = 1.0) -> bool:
     """Return whether colors are sRGB texels of 8 bits times factors up to a limit."""
     is_color = use.is_srgb and len(use.channels) == 3 and use.bias[:3] == NO_BIAS[:3]
     return (
         is_color
         and has_colors_of_8_bits(use.data)
-        and all(0.0 <= scale <= most for scale in use.scale[:3])
+        and all(0.0 <= scale <= max_scale for scale in use.scale[:3])
     )
 
 
-def _is_its_alpha(opacity_use: UsdTextureUse, color_use: UsdTextureUse) -> bool:
+def _is_alpha_of(opacity_use: UsdTextureUse, color_use: UsdTextureUse) -> bool:
     """Return whether an opacity is the alpha of the image of the color."""
     is_unchanged_alpha = (
         opacity_use.channels == CHANNELS["a"]
@@ -878,11 +891,11 @@ def _is_its_alpha(opacity_use: UsdTextureUse, color_use: UsdTextureUse) -> bool:
     return is_unchanged_alpha and opacity_use.data == color_use.data
 
 
-def _resized(values: Array, size: tuple[int, int]) -> Array:
+def _resize(values: Array, size: tuple[int, int]) -> Array:
     """Return an image (H, W) or (H, W, C) resized to (width, height), bilinearly."""
     if values.ndim == 3:
         channels = [
-            _resized(values[:, :, channel], size) for channel in range(values.shape[2])
+            _resize(values[:, :, channel], size) for channel in range(values.shape[2])
         ]
         return np.stack(channels, axis=2)
     if (values.shape[1], values.shape[0]) == size:
