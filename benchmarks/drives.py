@@ -214,7 +214,7 @@ def rules(runs: int) -> int:
                     here = under(rng, drives)  # noqa: B023
                     right = np.where(
                         here,
-                        answer(rng, drives, 0.8 - less),
+                        answer(rng, drives, 0.8 - less),  # noqa: B023
                         answer(rng, drives, 0.8),  # noqa: B023
                     )
                     right = right if less else answer(rng, drives, 0.8)  # noqa: B023
