@@ -72,20 +72,9 @@ def _shell(
         corner: fraction of the columns, from the middle of front and rear, at which the
             charts are cut.
     """
-    # angles are equally far apart along the widest outline, symmetrical, from the
-    # rear's middle
-    _, half, front, rear = rows[np.argmax(rows[:, 1])]
-    fine = np.linspace(-np.pi, np.pi, 8001)
-    x, y = _outline(fine, front - middle, rear - middle, half, power, 0.0)
-    arc_length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    angle = np.interp(np.linspace(0.0, arc_length[-1], COLUMNS + 1), arc_length, fine)
-    points = np.empty((len(rows), COLUMNS + 1, 3))
-    for row, (share, half, front, rear) in zip(points, rows, strict=True):
-        x, y = _outline(angle, front, rear, half, power, middle)
-        row[:, 0], row[:, 1], row[:, 2] = x, y, height(np.full_like(x, share), x, y)
-    wrapped_points = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
-    column_tangent = np.gradient(wrapped_points, axis=1)[:, 1:-1]
-    normals = shapes.normalize(np.cross(column_tangent, np.gradient(points, axis=0)))
+    angle = _outline_angles(rows, power, middle)
+    points = _shell_points(rows, power, middle, height, angle)
+    normals = _shell_normals(points)
     opposite = COLUMNS // 2
     cut = int(COLUMNS * corner)
     patches = []
@@ -106,6 +95,37 @@ def _shell(
             )
         )
     return patches
+
+
+def _outline_angles(rows: Array, power: float, middle: float) -> Array:
+    """Return the angles (C,) of columns that are equally far apart along the widest outline."""
+    # angles are equally far apart along the widest outline, symmetrical, from the
+    # rear's middle
+    _, half, front, rear = rows[np.argmax(rows[:, 1])]
+    fine = np.linspace(-np.pi, np.pi, 8001)
+    x, y = _outline(fine, front - middle, rear - middle, half, power, 0.0)
+    arc_length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    return np.interp(np.linspace(0.0, arc_length[-1], COLUMNS + 1), arc_length, fine)
+
+
+def _shell_points(
+    rows: Array, power: float, middle: float, height: Height, angle: Array
+) -> Array:
+    """Return the points (R, C, 3) of a stack of superellipses at the angles of the columns."""
+    points = np.empty((len(rows), COLUMNS + 1, 3))
+    for row, (share, half, front, rear) in zip(points, rows, strict=True):
+        x, y = _outline(angle, front, rear, half, power, middle)
+        row[:, 0] = x
+        row[:, 1] = y
+        row[:, 2] = height(np.full_like(x, share), x, y)
+    return points
+
+
+def _shell_normals(points: Array) -> Array:
+    """Return the normals (R, C, 3) at points (R, C, 3) of a closed shell."""
+    wrapped_points = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
+    column_tangent = np.gradient(wrapped_points, axis=1)[:, 1:-1]
+    return shapes.normalize(np.cross(column_tangent, np.gradient(points, axis=0)))
 
 
 def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
@@ -191,10 +211,7 @@ def _inside(p: Array) -> dict[str, Array]:
     """Return about how far points (N, 3) lie inside each of `OPENINGS` (N,)."""
     x, y, z = p.T
     abs_y = np.abs(y)
-    reach = np.where(x >= MIDDLE, 0.9 - MIDDLE, MIDDLE + 1.86)
-    cabin_radius = (
-        np.abs((x - MIDDLE) / reach) ** _CABIN_POWER + np.abs(y / 0.72) ** _CABIN_POWER
-    ) ** (1 / _CABIN_POWER)
+    cabin_radius = _cabin_radius(x, y)
     # about half the cabin's width
     half_width = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
     sill = _WAIST(x) + 0.04
@@ -202,18 +219,14 @@ def _inside(p: Array) -> dict[str, Array]:
     # distance behind the line of the windscreen's pillar
     pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81
     rear = (x + 1.62) * 0.72 - (z - 0.98) * 0.69
-    lamp = abs_y - 0.42
-    lens = _softest(lamp, x - 1.66, z - (0.565 + 0.1 * lamp), 0.665 + 0.2 * lamp - z)
+    lens = _inside_headlight(abs_y, x, z)
     low_grille = _softest(
         0.62 - abs_y, z - 0.24 + 0.02 * abs_y, 0.37 - 0.02 * abs_y - z
     )
     high_grille = _softest(
         0.41 - abs_y, z - 0.5 - 0.04 * abs_y, 0.64 + 0.04 * abs_y - z
     )
-    arches = [
-        np.where(abs_y > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), -1.0)
-        for axle in AXLES
-    ]
+    arches = _inside_arches(abs_y, x, z)
     return {
         "cabin": 0.72 * (1.0 - cabin_radius),
         "front arch": arches[0],
@@ -236,6 +249,28 @@ def _inside(p: Array) -> dict[str, Array]:
             abs_y > 0.45, _softest(pillar, rear, z - sill, lintel - z), -1.0
         ),
     }
+
+
+def _inside_headlight(abs_y: Array, x: Array, z: Array) -> Array:
+    """Return how far points lie inside the outline of the headlights."""
+    lamp = abs_y - 0.42
+    return _softest(lamp, x - 1.66, z - (0.565 + 0.1 * lamp), 0.665 + 0.2 * lamp - z)
+
+
+def _cabin_radius(x: Array, y: Array) -> Array:
+    """Return the radius of points in the superellipse of the cabin, 1 at its edge."""
+    reach = np.where(x >= MIDDLE, 0.9 - MIDDLE, MIDDLE + 1.86)
+    return (
+        np.abs((x - MIDDLE) / reach) ** _CABIN_POWER + np.abs(y / 0.72) ** _CABIN_POWER
+    ) ** (1 / _CABIN_POWER)
+
+
+def _inside_arches(abs_y: Array, x: Array, z: Array) -> list[Array]:
+    """Return how far points lie inside the front and the rear wheel arch."""
+    return [
+        np.where(abs_y > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), -1.0)
+        for axle in AXLES
+    ]
 
 
 OPENINGS: dict[str, dict[str, str | None]] = {
@@ -283,14 +318,7 @@ def _wheels() -> list[Patch]:
     """Create the four wheels, the front ones turned."""
     half = TYRE / 2  # about the z axis, the outer side up, in the middle of the tyre
     rim = 0.212
-    outside = [
-        (rim, half - 0.008),
-        (rim + 0.012, half),
-        (0.29, half + 0.004),
-        (WHEEL - 0.012, half - 0.02),
-    ]
-    tread = [(WHEEL, half - 0.05), (WHEEL, 0.0), (WHEEL, 0.05 - half)]
-    tyre = [*((r, -z) for r, z in outside), *tread[::-1], *outside[::-1]]
+    tyre = _tyre_profile(rim, half)
     deep = half - 0.06
     wheel = shapes.lathe([("rubber", tyre)], 28)
     wheel += shapes.lathe(
@@ -326,6 +354,18 @@ def _wheels() -> list[Patch]:
             wheel, turn, (axle, side * (0.852 - TYRE / 2), WHEEL)
         )
     return patches
+
+
+def _tyre_profile(rim: float, half: float) -> list[tuple[float, float]]:
+    """Return the points (r, z) of the profile of a tyre from one side of the rim to the other."""
+    outside = [
+        (rim, half - 0.008),
+        (rim + 0.012, half),
+        (0.29, half + 0.004),
+        (WHEEL - 0.012, half - 0.02),
+    ]
+    tread = [(WHEEL, half - 0.05), (WHEEL, 0.0), (WHEEL, 0.05 - half)]
+    return [*((r, -z) for r, z in outside), *tread[::-1], *outside[::-1]]
 
 
 def _wells() -> list[Patch]:

@@ -60,19 +60,12 @@ def chair(draw: ParameterSampler) -> Instance:
     leg = draw(2.1, 1.5, 3.0)
     splay = draw(1.5, 0.0, 6.0)
     lean = draw(5.0, 1.0, 11.0)
-    square = draw.chance(0.5, True)
-    section = (
-        shapes.rectangle(2.0, 2.0, 0.5, 2) if square else shapes.ellipse(1.0, 1.0, 16)
-    )
+    section = _leg_section(draw)
     taper = (leg * draw(0.75, 0.55, 1.0), leg)
     x = deep / 2 - leg - 0.4
     y = wide / 2 - leg - 0.4
     patches: list[Patch] = []
-    for sx, sy in product((-1.0, 1.0), repeat=2):
-        foot = (sx * (x + splay), sy * (y + splay), 0.0)
-        patches += _post(
-            "up", foot, (sx * x, sy * y, seat - thick + 0.5), section, taper
-        )
+    patches += _chair_legs(x, splay, y, seat, thick, section, taper)
     patches += shapes.box(
         "seat",
         (0.0, 0.0, seat - thick / 2),
@@ -91,29 +84,70 @@ def chair(draw: ParameterSampler) -> Instance:
             cells=2,
         )
     if draw.chance(0.55, True):
-        low = seat * draw(0.36, 0.25, 0.6)
-        spread = splay * (1.0 - low / seat)
-        front_x = x + spread
-        side_y = y + spread
-        thin = (0.55 * leg, 0.55 * leg)
-        thinner = (0.5 * leg, 0.5 * leg)
-        for sy in (-1.0, 1.0):
-            patches += _post(
-                "along",
-                (-front_x, sy * side_y, low),
-                (front_x, sy * side_y, low),
-                section,
-                thin,
-            )
-        patches += _post(
-            "cross", (0.0, -side_y, low), (0.0, side_y, low), section, thinner
-        )
+        patches += _chair_rungs(draw, seat, splay, x, y, leg, section)
     patches += _chair_back(draw, x, y, seat, total, lean, leg, section)
     rotated = shapes.transform_patches(
         patches, shapes.rotation("z", draw(8.0, -25.0, 25.0))
     )
-    paints = _chair_paints(draw, total)
-    return Instance(rotated, paints, sample_material(draw, 0.45, 0.2))
+    return Instance(
+        rotated, _chair_paints(draw, total), sample_material(draw, 0.45, 0.2)
+    )
+
+
+def _leg_section(draw: ParameterSampler) -> Array:
+    """Sample the section (M, 2) of the legs of a chair: square or round."""
+    square = draw.chance(0.5, True)
+    return (
+        shapes.rectangle(2.0, 2.0, 0.5, 2) if square else shapes.ellipse(1.0, 1.0, 16)
+    )
+
+
+def _chair_legs(
+    x: float,
+    splay: float,
+    y: float,
+    seat: float,
+    thick: float,
+    section: Array,
+    taper: tuple[float, float],
+) -> list[Patch]:
+    """Create the four legs of a chair."""
+    patches = list[Patch]()
+    for sx, sy in product((-1.0, 1.0), repeat=2):
+        foot = (sx * (x + splay), sy * (y + splay), 0.0)
+        patches += _post(
+            "up", foot, (sx * x, sy * y, seat - thick + 0.5), section, taper
+        )
+    return patches
+
+
+def _chair_rungs(
+    draw: ParameterSampler,
+    seat: float,
+    splay: float,
+    x: float,
+    y: float,
+    leg: float,
+    section: Array,
+) -> list[Patch]:
+    """Create the rungs between the legs of a chair."""
+    patches = list[Patch]()
+    low = seat * draw(0.36, 0.25, 0.6)
+    spread = splay * (1.0 - low / seat)
+    front_x = x + spread
+    side_y = y + spread
+    thin = (0.55 * leg, 0.55 * leg)
+    thinner = (0.5 * leg, 0.5 * leg)
+    for sy in (-1.0, 1.0):
+        patches += _post(
+            "along",
+            (-front_x, sy * side_y, low),
+            (front_x, sy * side_y, low),
+            section,
+            thin,
+        )
+    patches += _post("cross", (0.0, -side_y, low), (0.0, side_y, low), section, thinner)
+    return patches
 
 
 def _chair_paints(draw: ParameterSampler, total: float) -> dict[str, Paint]:
@@ -195,14 +229,13 @@ def _chair_back(
         count = int(draw.pick(5, 3, 4, 6))
         low = seat + 0.22 * high if style == "slats" else seat - 1.0
         for i in range(count):
-            shift = inner * ((i + 1) / (count + 1) - 0.5)
             top = total - 0.15 * high
             patches += slat(
                 "up",
                 (low + top) / 2,
                 inner * draw(0.075, 0.05, 0.11),
                 top - low + 1.0,
-                shift,
+                inner * ((i + 1) / (count + 1) - 0.5),
             )
     elif style == "ladder":
         count = int(draw.pick(3, 2, 4))
@@ -330,6 +363,16 @@ def lamp(draw: ParameterSampler) -> Instance:
     patches += shapes.sphere(
         "bulb", min(3.0, 0.4 * narrow), (0.0, 0.0, low + 0.42 * tall), 12, 20
     )
+    patches += _lamp_frame(total, tall, narrow, wide, low)
+    paints = _lamp_paints(draw, low, total, style)
+    return Instance(patches, paints, sample_material(draw, 0.4, 0.3), {"lining": 0.6})
+
+
+def _lamp_frame(
+    total: float, tall: float, narrow: float, wide: float, low: float
+) -> list[Patch]:
+    """Create the rod of a lamp, and the spokes that hold its shade."""
+    patches = list[Patch]()
     ring_z = total - 0.12 * tall
     inside = narrow + (wide - narrow) * 0.12
     for angle in (20.0, 140.0, 260.0):
@@ -347,6 +390,13 @@ def lamp(draw: ParameterSampler) -> Instance:
         (1.0, 1.0, 1.6, 0.0),
         first=(1.0, 0.0, 0.0),
     )
+    return patches
+
+
+def _lamp_paints(
+    draw: ParameterSampler, low: float, total: float, style: str
+) -> dict[str, Paint]:
+    """Sample the paints of a lamp."""
     offset = draw.offset()
     linen = draw.sample_color(
         "f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25
@@ -357,7 +407,7 @@ def lamp(draw: ParameterSampler) -> Instance:
     )
     body = paint_or_random(draw, total, clouded(clay, 1.3, 4.0, offset), 0.35)
     metal = draw.sample_color("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
-    paints = {
+    return {
         "shade": cloth,
         "rim": solid(shade(linen, 0.8)),
         "lining": solid("f4f0e4"),
@@ -366,4 +416,3 @@ def lamp(draw: ParameterSampler) -> Instance:
         "foot": solid(metal),
         "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
     }
-    return Instance(patches, paints, sample_material(draw, 0.4, 0.3), {"lining": 0.6})

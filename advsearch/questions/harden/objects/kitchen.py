@@ -28,15 +28,7 @@ from advsearch.questions.harden.objects.textures import (
 
 def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
     """A spout along +x with an open, hollow end."""
-    style = draw.pick("curved", "straight")
-    start = np.array([radius * 0.72, 0.0, height * draw(0.34, 0.26, 0.42)])
-    tip = np.array([radius * draw(1.85, 1.6, 2.0), 0.0, height * draw(0.94, 0.8, 1.02)])
-    bend = 0.22 if style == "curved" else 0.04
-    middle = (start + tip) / 2 + np.array([bend, 0.0, -0.6 * bend]) * radius * 0.5
-    above = (
-        start + (tip - start) * 0.8 + np.array([-bend * 0.1, 0.0, -0.1 * bend]) * radius
-    )
-    path = shapes.spline([start, middle, above, tip], 18)
+    path = _spout_path(draw, radius, height)
     root = draw(1.75, 1.3, 2.2)
     end = draw(0.72, 0.55, 0.95)
     scale = end + (root - end) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
@@ -56,6 +48,19 @@ def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
         radii,
         frame=frame,
     )
+
+
+def _spout_path(draw: ParameterSampler, radius: float, height: float) -> Array:
+    """Sample the path (18, 3) of a spout."""
+    style = draw.pick("curved", "straight")
+    start = np.array([radius * 0.72, 0.0, height * draw(0.34, 0.26, 0.42)])
+    tip = np.array([radius * draw(1.85, 1.6, 2.0), 0.0, height * draw(0.94, 0.8, 1.02)])
+    bend = 0.22 if style == "curved" else 0.04
+    middle = (start + tip) / 2 + np.array([bend, 0.0, -0.6 * bend]) * radius * 0.5
+    above = (
+        start + (tip - start) * 0.8 + np.array([-bend * 0.1, 0.0, -0.1 * bend]) * radius
+    )
+    return shapes.spline([start, middle, above, tip], 18)
 
 
 @family(metres=0.01)
@@ -220,25 +225,35 @@ def frying_pan(draw: ParameterSampler) -> Instance:
     root = np.array([rim - 0.6, 0.0, 0.78 * depth])
     rise = draw(2.6, 0.6, 4.5)
     grip = _pan_handle(draw, root, length, rise)
+    rivets = _wall_rivets(side, depth, wall)
+    bracket = _pan_bracket(rim, depth, length, rise)
+    patches = shapes.transform_patches(
+        [*body, *grip, *rivets, *bracket], shapes.rotation("z", 118.0)
+    )
+    paints = _pan_paints(draw, rim, depth)
+    return Instance(patches, paints, sample_material(draw, 0.38, 0.3), {"base": 0.5})
+
+
+def _wall_rivets(side: Array, depth: float, wall: float) -> list[Patch]:
+    """Create the rivets on the inside of a pan's wall."""
     inner_radius = shapes.radius_at_height(side, 0.72 * depth) - wall
-    rivets = _pan_rivets(inner_radius, 0.72 * depth)
+    return _pan_rivets(inner_radius, 0.72 * depth)
+
+
+def _pan_bracket(rim: float, depth: float, length: float, rise: float) -> list[Patch]:
+    """Create the bracket that holds the handle of a pan."""
     spine = [
         (rim - 1.4, 0.72 * depth),
         (rim - 0.3, 0.75 * depth),
         (rim + 0.2 * length, 0.78 * depth + 0.5 * rise),
     ]
-    bracket = shapes.sweep(
+    return shapes.sweep(
         "bracket",
         shapes.to_xz_plane(np.array(spine)),
         shapes.rectangle(0.7, 3.0, 0.25),
         (1.0, 1.0, 0.62),
         caps=True,
     )
-    patches = shapes.transform_patches(
-        [*body, *grip, *rivets, *bracket], shapes.rotation("z", 118.0)
-    )
-    paints = _pan_paints(draw, rim, depth)
-    return Instance(patches, paints, sample_material(draw, 0.38, 0.3), {"base": 0.5})
 
 
 def _pan_handle(

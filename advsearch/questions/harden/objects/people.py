@@ -51,7 +51,7 @@ def _rest(charts: Array, points: Array) -> ChartToPoints:
 def _patches(person: Any) -> list[Patch]:
     """Return the patches of a body, with smooth normals across the seams of charts."""
     data = person.data
-    vertices = person.standing.numpy().astype(np.float64)
+    vertices = person.standing_points.numpy().astype(np.float64)
     index = data["index"].astype(np.int64)
     reference = data["mean"][index] * 1e-4 + np.einsum(
         "r,rpc->pc", data["shares"][1, 1, 1, 1], data["basis"][:, index]
@@ -61,6 +61,38 @@ def _patches(person: Any) -> list[Patch]:
     first_vertex = np.cumsum([0, *data["points"]])
     first_face = np.cumsum([0, *data["triangles"]])
     faces = data["faces"].astype(np.int64)
+    normals = _smooth_normals(vertices, index, faces, first_vertex, first_face)
+    patches = []
+    for number, tag in enumerate(data["tags"]):
+        chart_vertices = slice(first_vertex[number], first_vertex[number + 1])
+        chart_faces = faces[first_face[number] : first_face[number + 1]]
+        patches.append(
+            Patch(
+                str(tag),
+                vertices[chart_vertices],
+                normals[chart_vertices],
+                charts[chart_vertices],
+                chart_faces,
+                _chart_size(data["sizes"][number]),
+                _rest(charts[chart_vertices], reference[chart_vertices]),
+            )
+        )
+    return patches
+
+
+def _chart_size(size: Array) -> tuple[float, float]:
+    """Return the width and the height of a chart."""
+    return float(size[0]), float(size[1])
+
+
+def _smooth_normals(
+    vertices: Array,
+    index: assets.IntArray,
+    faces: assets.IntArray,
+    first_vertex: assets.IntArray,
+    first_face: assets.IntArray,
+) -> Array:
+    """Return normals (V, 3) that are smooth across the seams of charts."""
     all_faces = np.concatenate(
         [
             faces[a:b] + start
@@ -69,9 +101,7 @@ def _patches(person: Any) -> list[Patch]:
             )
         ]
     )
-    normal_sum = np.zeros(
-        (int(index.max()) + 1, 3)
-    )  # smooth across the seams of charts
+    normal_sum = np.zeros((int(index.max()) + 1, 3))
     np.add.at(
         normal_sum,
         index[all_faces].reshape(-1),
@@ -79,24 +109,7 @@ def _patches(person: Any) -> list[Patch]:
     )
     normals = normal_sum[index]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    patches = []
-    for number, tag in enumerate(data["tags"]):
-        chart_vertices = slice(first_vertex[number], first_vertex[number + 1])
-        chart_faces = faces[first_face[number] : first_face[number + 1]]
-        width, height = map(float, data["sizes"][number])
-        rest = _rest(charts[chart_vertices], reference[chart_vertices])
-        patches.append(
-            Patch(
-                str(tag),
-                vertices[chart_vertices],
-                normals[chart_vertices],
-                charts[chart_vertices],
-                chart_faces,
-                (width, height),
-                rest,
-            )
-        )
-    return patches
+    return normals
 
 
 @painter

@@ -348,19 +348,7 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
     ]
     uvs = np.concatenate([[[0.5, 0.5]], np.stack(disc_uvs, axis=-1).reshape(-1, 2)])
 
-    column = np.arange(columns)
-    next_column = (column + 1) % columns
-    faces = [_fan(columns)]
-    for row in range(len(curve) - 2):
-        inner = 1 + row * columns
-        outer = 1 + (row + 1) * columns
-        faces += [
-            np.stack([inner + column, outer + column, outer + next_column], axis=1),
-            np.stack(
-                [inner + column, outer + next_column, inner + next_column], axis=1
-            ),
-        ]
-    triangles = np.concatenate(faces)
+    triangles = _disc_triangles(columns, curve)
 
     def rest(u: Array, v: Array) -> Array:
         x = (2 * u - 1) * mirror
@@ -387,6 +375,23 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
         size,
         rest,
     )
+
+
+def _disc_triangles(columns: int, curve: Array) -> assets.IntArray:
+    """Return the triangles (F, 3) of a disc with rings of vertices around a pole."""
+    column = np.arange(columns)
+    next_column = (column + 1) % columns
+    faces = [_fan(columns)]
+    for row in range(len(curve) - 2):
+        inner = 1 + row * columns
+        outer = 1 + (row + 1) * columns
+        faces += [
+            np.stack([inner + column, outer + column, outer + next_column], axis=1),
+            np.stack(
+                [inner + column, outer + next_column, inner + next_column], axis=1
+            ),
+        ]
+    return np.concatenate(faces)
 
 
 def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]:
@@ -456,27 +461,8 @@ def vessel(
         columns: faces around the axis.
         step: longest edge along the profile.
     """
-    normal = _profile_normals([outside])[0]
-    inner = outside - wall * normal
-    remaining = np.arange(len(outside))
-    # points at which it runs backwards, as in tight bends, go; the last one stays
-    while len(remaining) > 2:
-        is_backward = (
-            np.diff(inner[remaining], axis=0) * np.diff(outside[remaining], axis=0)
-        ).sum(axis=1) <= 0.0
-        if not is_backward.any():
-            break
-        remaining = np.append(remaining[:-1][~is_backward], remaining[-1])
-    inner = inner[remaining][::-1]
-    lip_angle = np.pi * np.arange(1, 6) / 6
-    lip_center = outside[-1] - wall / 2 * normal[-1]
-    lip_across = wall / 2 * normal[-1]
-    lip_up = np.array([-lip_across[1], lip_across[0]])
-    lip = (
-        lip_center
-        + np.cos(lip_angle)[:, None] * lip_across
-        + np.sin(lip_angle)[:, None] * lip_up
-    )
+    normal, inner = _inner_profile(outside, wall)
+    lip = _round_lip(outside, wall, normal)
     fillet = min(1.5 * wall, 0.3 * float(outside[:, 0].max()))
     floor_radius = radius_at_height(inner[::-1], floor)
     inner = inner[
@@ -508,6 +494,36 @@ def vessel(
         ("inside", subdivide([fillet_end, (0.0, floor)], 3 * step)),
     ]
     return lathe(pieces, columns)
+
+
+def _inner_profile(outside: Array, wall: float) -> tuple[Array, Array]:
+    """Return the normals of a profile, and the inside of its wall from the lip down."""
+    normal = _profile_normals([outside])[0]
+    inner = outside - wall * normal
+    remaining = np.arange(len(outside))
+    # points at which it runs backwards, as in tight bends, go; the last one stays
+    while len(remaining) > 2:
+        is_backward = (
+            np.diff(inner[remaining], axis=0) * np.diff(outside[remaining], axis=0)
+        ).sum(axis=1) <= 0.0
+        if not is_backward.any():
+            break
+        remaining = np.append(remaining[:-1][~is_backward], remaining[-1])
+    inner = inner[remaining][::-1]
+    return normal, inner
+
+
+def _round_lip(outside: Array, wall: float, normal: Array) -> Array:
+    """Return points (5, 2) of a half circle from the outside of a wall to its inside."""
+    lip_angle = np.pi * np.arange(1, 6) / 6
+    lip_center = outside[-1] - wall / 2 * normal[-1]
+    lip_across = wall / 2 * normal[-1]
+    lip_up = np.array([-lip_across[1], lip_across[0]])
+    return (
+        lip_center
+        + np.cos(lip_angle)[:, None] * lip_across
+        + np.sin(lip_angle)[:, None] * lip_up
+    )
 
 
 def sphere(
@@ -578,22 +594,8 @@ def sweep(
     scales = np.broadcast_to(
         scales.reshape(-1, 1) if scales.ndim < 2 else scales, (len(centres), 2)
     )
-    scaled_section = section[None] * scales[:, None]
-    points = (
-        centres[:, None]
-        + scaled_section[..., :1] * first_normal[:, None]
-        + scaled_section[..., 1:] * second_normal[:, None]
-    )
-    normals = np.cross(
-        np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1),
-        np.gradient(points, axis=0),
-    )
-    normal_length = np.linalg.norm(normals, axis=-1)
-    normals = normalize(normals)
-    for row, direction in ((0, -1.0), (-1, 1.0)):  # where a row is a point
-        normals[row][normal_length[row] < 1e-7 * float(normal_length.max())] = (
-            direction * tangent[row]
-        )
+    points = _sweep_points(section, scales, centres, first_normal, second_normal)
+    normals = _sweep_normals(points, tangent)
     ring_fraction, ring_length = _along(np.concatenate([section, section[:1]]))
     closed = np.concatenate([points, points[:, :1]], axis=1)
     closed_normals = np.concatenate([normals, normals[:, :1]], axis=1)
@@ -615,6 +617,37 @@ def sweep(
             cap(tag, points[-1], tangent[-1]),
         ]
     return patches
+
+
+def _sweep_points(
+    section: Array,
+    scales: Array,
+    centres: Array,
+    first_normal: Array,
+    second_normal: Array,
+) -> Array:
+    """Return the points (N, M, 3) of a section that is scaled and moved along a path."""
+    scaled_section = section[None] * scales[:, None]
+    return (
+        centres[:, None]
+        + scaled_section[..., :1] * first_normal[:, None]
+        + scaled_section[..., 1:] * second_normal[:, None]
+    )
+
+
+def _sweep_normals(points: Array, tangent: Array) -> Array:
+    """Return the normals (N, M, 3) of a swept surface; along the path where it is a point."""
+    normals = np.cross(
+        np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1),
+        np.gradient(points, axis=0),
+    )
+    normal_length = np.linalg.norm(normals, axis=-1)
+    normals = normalize(normals)
+    for row, direction in ((0, -1.0), (-1, 1.0)):  # where a row is a point
+        normals[row][normal_length[row] < 1e-7 * float(normal_length.max())] = (
+            direction * tangent[row]
+        )
+    return normals
 
 
 def mean_lengths(points: Array, axis: int = 0) -> Array:
@@ -683,42 +716,65 @@ def box(
         i = (axis + 1) % 3
         j = (axis + 2) % 3
         for side in (1.0, -1.0):
-            # equal angles
-            edges = [
-                core[k] + bevel * np.tan(np.linspace(0.0, np.pi / 4, steps + 1))
-                for k in (i, j)
-            ]
-            flats = [np.linspace(-core[k], core[k], cells + 1) for k in (i, j)]
-            u, v = (
-                np.concatenate([-edge[:0:-1], flat, edge[1:]])
-                for edge, flat in zip(edges, flats, strict=True)
-            )
-            cube = np.empty((len(v), len(u), 3))
-            cube[..., axis] = half[axis]
-            cube[..., i], cube[..., j] = u[None], v[:, None]
-            inner = np.clip(cube, -core, core)
-            normal = normalize(cube - inner)
-            points = inner + bevel * normal
-            if side < 0:  # half a turn about the j axis: keeps orientation
-                points = points[:, ::-1].copy()
-                normal = normal[:, ::-1].copy()
-                points[..., axis] *= -1.0
-                normal[..., axis] *= -1.0
+            u, v = _face_coordinates(bevel, steps, cells, core, i, j)
+            normal, points = _rounded_face(bevel, v, u, half, axis, i, j, core, side)
             down = (v + half[j]) / (2 * half[j])
             across = (u + half[i]) / (2 * half[i])
             across = across if side > 0 else 1.0 - across[::-1]
-            extent = (2 * float(half[i]), 2 * float(half[j]))
             patches.append(
                 grid(
                     tag,
                     points + np.asarray(centre, dtype=np.float64),
                     normal,
-                    extent,
+                    (2 * float(half[i]), 2 * float(half[j])),
                     down,
                     across,
                 )
             )
     return patches
+
+
+def _face_coordinates(
+    bevel: float, steps: int, cells: int, core: Array, i: int, j: int
+) -> tuple[Array, Array]:
+    """Return coordinates along both axes of a box's face, denser in the rounded edges."""
+    # equal angles
+    edges = [
+        core[k] + bevel * np.tan(np.linspace(0.0, np.pi / 4, steps + 1)) for k in (i, j)
+    ]
+    flats = [np.linspace(-core[k], core[k], cells + 1) for k in (i, j)]
+    u, v = (
+        np.concatenate([-edge[:0:-1], flat, edge[1:]])
+        for edge, flat in zip(edges, flats, strict=True)
+    )
+    return u, v
+
+
+def _rounded_face(
+    bevel: float,
+    v: Array,
+    u: Array,
+    half: Array,
+    axis: int,
+    i: int,
+    j: int,
+    core: Array,
+    side: float,
+) -> tuple[Array, Array]:
+    """Return points and normals (V, U, 3) of a face of a box with rounded edges."""
+    cube = np.empty((len(v), len(u), 3))
+    cube[..., axis] = half[axis]
+    cube[..., i] = u[None]
+    cube[..., j] = v[:, None]
+    inner = np.clip(cube, -core, core)
+    normal = normalize(cube - inner)
+    points = inner + bevel * normal
+    if side < 0:  # half a turn about the j axis: keeps orientation
+        points = points[:, ::-1].copy()
+        normal = normal[:, ::-1].copy()
+        points[..., axis] *= -1.0
+        normal[..., axis] *= -1.0
+    return normal, points
 
 
 # ---- cutting
@@ -821,6 +877,21 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
         (int(start), int(end)): len(patch.vertices) + index
         for index, (start, end) in enumerate(crossed)
     }
+    faces, is_inside = _split_faces(patch, value, cut_of_edge)
+    split_patch = replace(
+        patch,
+        vertices=np.concatenate([patch.vertices, interpolate(patch.vertices)]),
+        normals=np.concatenate([patch.normals, cut_normals]),
+        uvs=np.concatenate([patch.uvs, interpolate(patch.uvs)]),
+        faces=np.array(faces),
+    )
+    return split_patch, np.array(is_inside)
+
+
+def _split_faces(
+    patch: Patch, value: Array, cut_of_edge: dict[tuple[int, int], int]
+) -> tuple[list[tuple[int, int, int]], list[bool]]:
+    """Split faces at the cut vertices of their edges, and tell for each whether it is inside."""
     faces: list[tuple[int, int, int]] = []
     is_inside: list[bool] = []
     for face in patch.faces:
@@ -837,14 +908,7 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
             for k in range(1, len(polygon) - 1):
                 faces.append((polygon[0], polygon[k], polygon[k + 1]))
                 is_inside.append(sign > 0.0)
-    split_patch = replace(
-        patch,
-        vertices=np.concatenate([patch.vertices, interpolate(patch.vertices)]),
-        normals=np.concatenate([patch.normals, cut_normals]),
-        uvs=np.concatenate([patch.uvs, interpolate(patch.uvs)]),
-        faces=np.array(faces),
-    )
-    return split_patch, np.array(is_inside)
+    return faces, is_inside
 
 
 def _outline_with_cuts(

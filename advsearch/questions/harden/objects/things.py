@@ -155,6 +155,24 @@ def ball(draw: ParameterSampler) -> Instance:
     offset = draw.offset()
     light = draw.sample_color("f1f0ea", "f4f4f2", "e8d34a", wild=0.3)
     dark = draw.sample_color("1d1f22", "23395d", "b5442e", wild=0.3)
+    paint, patches = _ball_surface(draw, style, light, radius, offset, patches, dark)
+    shaped = [
+        replace(p, vertices=p.vertices * np.array([1.0, 1.0, squash]))
+        for p in shapes.transform_patches(patches, turn)
+    ]
+    return Instance(shaped, {"ball": paint}, sample_material(draw, 0.4, 0.3))
+
+
+def _ball_surface(
+    draw: ParameterSampler,
+    style: str,
+    light: Array,
+    radius: float,
+    offset: Array,
+    patches: list[Patch],
+    dark: Array,
+) -> tuple[Paint, list[Patch]]:
+    """Sample the paint of a ball of a style, and return it with the ball's patches."""
     if style == "beach":
         bright = [
             draw.sample_color(code, wild=0.5)
@@ -192,11 +210,7 @@ def ball(draw: ParameterSampler) -> Instance:
             0.008,
             lambda d: football_seams(shapes.normalize(d))[0] * 1.5,
         )
-    shaped = [
-        replace(p, vertices=p.vertices * np.array([1.0, 1.0, squash]))
-        for p in shapes.transform_patches(patches, turn)
-    ]
-    return Instance(shaped, {"ball": paint}, sample_material(draw, 0.4, 0.3))
+    return paint, patches
 
 
 @family(metres=0.01)
@@ -206,6 +220,31 @@ def banana(draw: ParameterSampler) -> Instance:
     bend = draw(105.0, 65.0, 130.0)
     thick = draw(1.65, 1.45, 2.1)
     stem = draw(2.4, 1.6, 3.6)
+    path, radius = _banana_shape(draw, bend, length, stem, thick)
+    section = _banana_section(draw)
+    patches = shapes.sweep(
+        "banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True
+    )
+    patches = shapes.transform_patches(
+        patches, shapes.rotation("y", draw(9.0, 0.0, 14.0))
+    )
+    patches = shapes.transform_patches(
+        patches, shapes.rotation("z", draw(78.0, 45.0, 120.0))
+    )
+
+    paint = _banana_paint(draw, path, stem)
+
+    return Instance(
+        patches,
+        {"banana": paint_or_random(draw, length, paint, 0.4)},
+        sample_material(draw, 0.45, 0.1),
+    )
+
+
+def _banana_shape(
+    draw: ParameterSampler, bend: float, length: float, stem: float, thick: float
+) -> tuple[Array, Array]:
+    """Return the path (N, 3) of a banana, and its radius (N,) along it."""
     count = 44
     t = np.linspace(0.0, 1.0, count)
     angle = np.radians(bend * (t + 0.05 * np.sin(2 * np.pi * t)) - bend / 2)[:-1]
@@ -220,20 +259,19 @@ def banana(draw: ParameterSampler) -> Instance:
     full = np.sin(0.5 * np.pi * body) * np.maximum(np.sin(0.5 * np.pi * taper), 0.26)
     radius = thick * np.maximum(neck * (1.0 + 0.25 * np.exp(-at / 0.5)), full)
     radius = np.convolve(np.pad(radius, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+    return path, radius
+
+
+def _banana_section(draw: ParameterSampler) -> Array:
+    """Sample the section (M, 2) of a banana, with five ridges."""
     ridge = draw(0.06, 0.02, 0.1)
     phi = 2 * np.pi * np.arange(30) / 30
     lumps = 1.0 + ridge * (np.abs(np.cos(2.5 * phi)) - 0.6)
-    section = np.stack([np.cos(phi), np.sin(phi)], axis=1) * lumps[:, None]
-    patches = shapes.sweep(
-        "banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True
-    )
-    patches = shapes.transform_patches(
-        patches, shapes.rotation("y", draw(9.0, 0.0, 14.0))
-    )
-    patches = shapes.transform_patches(
-        patches, shapes.rotation("z", draw(78.0, 45.0, 120.0))
-    )
+    return np.stack([np.cos(phi), np.sin(phi)], axis=1) * lumps[:, None]
 
+
+def _banana_paint(draw: ParameterSampler, path: Array, stem: float) -> Paint:
+    """Sample the paint of a banana: green and brown towards its ends, with flecks."""
     offset = draw.offset()
     skin = draw.sample_color("f0c930", "f3d64a", "e3b62a", "b7c04a", wild=0.0)
     tip, brown, green = map(parse_hex_color, ("3a2a18", "6b4520", "a9b13c"))
@@ -257,11 +295,7 @@ def banana(draw: ParameterSampler) -> Instance:
         base = mix(base, tip, step(-start, -0.45, 0.5))
         return mix(base, tip, step(-end, -0.75, 0.5))
 
-    return Instance(
-        patches,
-        {"banana": paint_or_random(draw, length, paint, 0.4)},
-        sample_material(draw, 0.45, 0.1),
-    )
+    return paint
 
 
 @family(metres=0.01)
@@ -281,6 +315,24 @@ def book(draw: ParameterSampler) -> Instance:
         patches += shapes.box("cover", (0.25, 0.0, z), (width, height, board), 0.12)
     size = (width - lip - 0.5, height - 2 * lip, thick - 2 * board + 0.04)
     patches += shapes.box("pages", (0.3 - lip / 2, 0.0, thick / 2), size, 0.05, steps=1)
+    patches += _round_spine(thick, width, bulge, board, height)
+    turned = shapes.transform_patches(
+        patches, shapes.rotation("z", draw(-122.0, -150.0, -100.0))
+    )
+
+    front, pages_paint, spine = _book_paints(draw, height, width, thick)
+
+    return Instance(
+        turned,
+        {"cover": front, "pages": pages_paint, "spine": spine},
+        sample_material(draw, 0.55, 0.0),
+    )
+
+
+def _round_spine(
+    thick: float, width: float, bulge: float, board: float, height: float
+) -> list[Patch]:
+    """Create the rounded spine of a book."""
     half = thick / 2
     angle = np.linspace(-np.pi / 2, np.pi / 2, 9)
     cosine = np.cos(angle)
@@ -292,11 +344,13 @@ def book(draw: ParameterSampler) -> Instance:
         [-width / 2 + 0.25 - bulge * cosine + board, half + (half - board) * sine],
         axis=1,
     )[::-1]
-    patches += _spine(outer, inner, height)
-    turned = shapes.transform_patches(
-        patches, shapes.rotation("z", draw(-122.0, -150.0, -100.0))
-    )
+    return _spine(outer, inner, height)
 
+
+def _book_paints(
+    draw: ParameterSampler, height: float, width: float, thick: float
+) -> tuple[Paint, Paint, Paint]:
+    """Sample the paints of the cover, the pages and the spine of a book."""
     offset = draw.offset()
     cloth = draw.sample_color(
         "7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd"
@@ -338,11 +392,7 @@ def book(draw: ParameterSampler) -> Instance:
         )
         return mix(base(t), gold, np.maximum(band, block * words))
 
-    return Instance(
-        turned,
-        {"cover": front, "pages": pages_paint, "spine": spine},
-        sample_material(draw, 0.55, 0.0),
-    )
+    return front, pages_paint, spine
 
 
 def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
@@ -524,32 +574,8 @@ def stop_sign(draw: ParameterSampler) -> Instance:
     radius = draw(0.45, 0.4, 0.5)
     height = draw(0.74, 0.66, 0.84)
     red = draw.sample_color("b3121d", "a8161f", "c0202a", wild=0.0)
-    ring = shapes.polygon(8, 0.02, 2) * radius
-    ahead = np.array([1.0, 0.0, 0.0])
-    # an octagon that looks along +x, its middle at the origin
-    back = np.insert(ring, 0, 0.0, axis=1)
-    edge = shapes.sweep(
-        "metal", [(0.0, 0.0, 0.0), 0.004 * ahead], ring, first=(0.0, 1.0, 0.0)
-    )
-    plate = [
-        shapes.cap("face", back + 0.004 * ahead, ahead),
-        *edge,
-        shapes.cap("metal", back[::-1], -ahead),
-    ]
-    plate = shapes.transform_patches(plate, offset=(0.036, 0.0, height))
-    tube = shapes.round_corners(
-        [
-            (0.03, 0.0),
-            (0.03, height + 0.7 * radius),
-            (0.0, height + 0.7 * radius + 0.004),
-        ],
-        0.004,
-        2,
-    )
-    post = shapes.lathe(
-        [("post", [(0.0, 0.0), (0.03, 0.0)]), ("post", tube[:-1]), ("post", tube[-2:])],
-        20,
-    )
+    plate = _sign_plate(radius, height)
+    post = _sign_post(height, radius)
     foot = shapes.box("rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), 0.02, 2)
     foot += shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), 0.01, 1)
     heights = (height - 0.5 * radius, height + 0.5 * radius)
@@ -574,4 +600,38 @@ def stop_sign(draw: ParameterSampler) -> Instance:
         FINISHES["face"],
         {"metal": 0.25, "post": 0.18, "rubber": 0.3},
         FINISHES,
+    )
+
+
+def _sign_plate(radius: float, height: float) -> list[Patch]:
+    """Create the octagonal plate of a stop sign."""
+    ring = shapes.polygon(8, 0.02, 2) * radius
+    ahead = np.array([1.0, 0.0, 0.0])
+    # an octagon that looks along +x, its middle at the origin
+    back = np.insert(ring, 0, 0.0, axis=1)
+    edge = shapes.sweep(
+        "metal", [(0.0, 0.0, 0.0), 0.004 * ahead], ring, first=(0.0, 1.0, 0.0)
+    )
+    plate = [
+        shapes.cap("face", back + 0.004 * ahead, ahead),
+        *edge,
+        shapes.cap("metal", back[::-1], -ahead),
+    ]
+    return shapes.transform_patches(plate, offset=(0.036, 0.0, height))
+
+
+def _sign_post(height: float, radius: float) -> list[Patch]:
+    """Create the post of a stop sign."""
+    tube = shapes.round_corners(
+        [
+            (0.03, 0.0),
+            (0.03, height + 0.7 * radius),
+            (0.0, height + 0.7 * radius + 0.004),
+        ],
+        0.004,
+        2,
+    )
+    return shapes.lathe(
+        [("post", [(0.0, 0.0), (0.03, 0.0)]), ("post", tube[:-1]), ("post", tube[-2:])],
+        20,
     )

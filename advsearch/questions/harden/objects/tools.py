@@ -8,6 +8,7 @@ import advsearch.questions.harden.objects.shapes as shapes
 from advsearch.questions.harden.objects.family import Instance, family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
+    Paint,
     ParameterSampler,
     Texels,
     band_mask,
@@ -87,6 +88,30 @@ def hammer(draw: ParameterSampler) -> Instance:
     eye = half * draw(1.25, 1.1, 1.5)
     front = max(front, 2.2 * eye)
 
+    head = _hammer_head(draw, half, eye, style, front, face)
+
+    belly, thick, stick = _hammer_stick(draw, half, length)
+
+    top = max(half * 1.05, face if style != "sledge" else face * 1.2)
+    tilt = np.degrees(np.arctan2(top - thick * (1.0 + belly), 0.8 * length))
+    patches = shapes.transform_patches(
+        shapes.transform_patches([*head, *stick], shapes.rotation("y", -float(tilt))),
+        shapes.rotation("z", draw(58.0, 20.0, 90.0)),
+    )
+
+    paints = _hammer_paints(draw, front, length)
+    return Instance(patches, paints, sample_material(draw, 0.38, 0.2))
+
+
+def _hammer_head(
+    draw: ParameterSampler,
+    half: float,
+    eye: float,
+    style: str,
+    front: float,
+    face: float,
+) -> list[Patch]:
+    """Create the head of a hammer of a style."""
     scale = np.array([[0.82, 0.82], [1, 1], [1, 1], [0.86, 0.86]]) * half * 1.05
     path = _along_y(-eye * 1.1, -eye * 0.9, eye * 0.9, eye * 1.15)
     head = shapes.sweep(
@@ -135,7 +160,13 @@ def hammer(draw: ParameterSampler) -> Instance:
             )
         else:
             head += _peen(draw, half, eye, draw(4.0, 3.0, 5.0))
+    return head
 
+
+def _hammer_stick(
+    draw: ParameterSampler, half: float, length: float
+) -> tuple[float, float, list[Patch]]:
+    """Create the handle of a hammer; also return its swelling and its thickness."""
     t = np.linspace(0.0, 1.0, 30)
     belly = draw(0.16, 0.0, 0.3)
     grip = (
@@ -159,14 +190,13 @@ def hammer(draw: ParameterSampler) -> Instance:
         else shapes.rectangle(2.0, 2.0, 0.7)
     )
     stick = shapes.sweep("handle", path, section, scale, first=(0.0, 1.0, 0.0))
+    return belly, thick, stick
 
-    top = max(half * 1.05, face if style != "sledge" else face * 1.2)
-    tilt = np.degrees(np.arctan2(top - thick * (1.0 + belly), 0.8 * length))
-    patches = shapes.transform_patches(
-        shapes.transform_patches([*head, *stick], shapes.rotation("y", -float(tilt))),
-        shapes.rotation("z", draw(58.0, 20.0, 90.0)),
-    )
 
+def _hammer_paints(
+    draw: ParameterSampler, front: float, length: float
+) -> dict[str, Paint]:
+    """Sample the paints of a hammer."""
     offset = draw.offset()
     steel = draw.sample_color("4b4f55", "8d9298", "2b2d30", "6b7078", wild=0.15)
     metal = over(
@@ -196,11 +226,10 @@ def hammer(draw: ParameterSampler) -> Instance:
             between(-2 * length, -0.45 * length, axis=0, soft=0.05),
             ribs,
         )
-    paints = {
+    return {
         "head": paint_or_random(draw, length, metal, 0.3),
         "handle": paint_or_random(draw, length, hold, 0.3),
     }
-    return Instance(patches, paints, sample_material(draw, 0.38, 0.2))
 
 
 def _weights(
@@ -283,6 +312,14 @@ def dumbbell(draw: ParameterSampler) -> Instance:
         shapes.transform_patches(patches, shapes.rotation("y", 90.0)),
         shapes.rotation("z", draw(118.0, 90.0, 150.0)),
     )
+    paints = _dumbbell_paints(draw, grip, style, length, radius)
+    return Instance(laid, paints, sample_material(draw, 0.42, 0.2))
+
+
+def _dumbbell_paints(
+    draw: ParameterSampler, grip: float, style: str, length: float, radius: float
+) -> dict[str, Paint]:
+    """Sample the paints of a dumbbell."""
     offset = draw.offset()
     iron = draw.sample_color(
         "26282b", "3a3d42", "8a8d92", "7a2f8f", "2f6f8f", "c23b4a", wild=0.25
@@ -317,5 +354,4 @@ def dumbbell(draw: ParameterSampler) -> Instance:
         ),
         solid(shade(steel, 0.55)),
     )
-    paints = {"weight": paint_or_random(draw, 2 * tip, weight, 0.35), "bar": knurl}
-    return Instance(laid, paints, sample_material(draw, 0.42, 0.2))
+    return {"weight": paint_or_random(draw, 2 * tip, weight, 0.35), "bar": knurl}

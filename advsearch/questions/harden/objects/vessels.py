@@ -155,20 +155,7 @@ def _ceramic(
 def mug(draw: ParameterSampler) -> Instance:
     """Make a mug with a handle."""
     height = draw(9.4, 7.6, 12.0)
-    top = draw(4.15, 3.6, 5.0)
-    foot = top * draw(0.93, 0.72, 1.02)
-    belly = draw(0.0, -0.06, 0.13) * top
-    wall = draw(0.36, 0.28, 0.5)
-    low = draw(0.7, 0.3, 1.2)
-    corners = [
-        (foot - low, 0.0),
-        (foot, low),
-        (0.5 * (foot + top) + belly, 0.5 * height),
-        (top, height),
-    ]
-    side = shapes.spline(np.array(corners[1:]), 14)
-    outside = np.concatenate([[corners[0], (foot - 0.3 * low, 0.25 * low)], side])
-    body = shapes.vessel(outside, wall, draw(0.6, 0.5, 0.9))
+    wall, side, body = _mug_body(draw, height)
 
     style = draw.pick("ear", "round", "square", "loop")
     grip_high = height * draw(0.85, 0.76, 0.88)
@@ -188,6 +175,27 @@ def mug(draw: ParameterSampler) -> Instance:
     return Instance(
         patches, paints, sample_material(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6}
     )
+
+
+def _mug_body(
+    draw: ParameterSampler, height: float
+) -> tuple[float, Array, list[Patch]]:
+    """Create a mug without its handle; also return its wall's thickness and its side's profile."""
+    top = draw(4.15, 3.6, 5.0)
+    foot = top * draw(0.93, 0.72, 1.02)
+    belly = draw(0.0, -0.06, 0.13) * top
+    wall = draw(0.36, 0.28, 0.5)
+    low = draw(0.7, 0.3, 1.2)
+    corners = [
+        (foot - low, 0.0),
+        (foot, low),
+        (0.5 * (foot + top) + belly, 0.5 * height),
+        (top, height),
+    ]
+    side = shapes.spline(np.array(corners[1:]), 14)
+    outside = np.concatenate([[corners[0], (foot - 0.3 * low, 0.25 * low)], side])
+    body = shapes.vessel(outside, wall, draw(0.6, 0.5, 0.9))
+    return wall, side, body
 
 
 def _mug_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
@@ -225,23 +233,7 @@ def bowl(draw: ParameterSampler) -> Instance:
     """Make a bowl."""
     radius = 8.0
     height = radius * draw(0.86, 0.6, 1.0)
-    foot = radius * draw(0.42, 0.34, 0.55)
-    ring = draw(0.7, 0.15, 1.1)
-    full = draw(0.86, 0.72, 0.97)  # how far out the wall already is at half height
-    flare = draw(0.0, -0.03, 0.1) * radius
-    knots = [
-        (foot * 1.04, ring),
-        (radius * 0.5 * (0.72 + full) * 0.92, ring + 0.22 * (height - ring)),
-        (radius * full, 0.55 * height),
-        (radius * (0.5 + 0.5 * full), 0.8 * height),
-        (radius + flare, height),
-    ]
-    body = shapes.vessel(
-        np.array([(foot, 0.0), *shapes.spline(knots, 22)]),
-        draw(0.45, 0.32, 0.65),
-        ring + 0.55,
-        step=0.9,
-    )
+    body = _bowl_body(draw, radius, height)
     offset = draw.offset()
     clay = draw.sample_color("3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f")
     glaze = clouded(clay, 0.72, 2.6, offset)
@@ -268,10 +260,43 @@ def bowl(draw: ParameterSampler) -> Instance:
     )
 
 
+def _bowl_body(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
+    """Create the surface of a bowl."""
+    foot = radius * draw(0.42, 0.34, 0.55)
+    ring = draw(0.7, 0.15, 1.1)
+    full = draw(0.86, 0.72, 0.97)  # how far out the wall already is at half height
+    flare = draw(0.0, -0.03, 0.1) * radius
+    knots = [
+        (foot * 1.04, ring),
+        (radius * 0.5 * (0.72 + full) * 0.92, ring + 0.22 * (height - ring)),
+        (radius * full, 0.55 * height),
+        (radius * (0.5 + 0.5 * full), 0.8 * height),
+        (radius + flare, height),
+    ]
+    return shapes.vessel(
+        np.array([(foot, 0.0), *shapes.spline(knots, 22)]),
+        draw(0.45, 0.32, 0.65),
+        ring + 0.55,
+        step=0.9,
+    )
+
+
 @family(metres=0.01)
 def bottle(draw: ParameterSampler) -> Instance:
     """Make a bottle with a cap and perhaps a label."""
     height = draw(30.0, 24.0, 32.0)
+    shoulder, patches = _bottle_body(draw, height)
+    paints = _bottle_paints(draw, height, shoulder)
+    return Instance(
+        shapes.transform_patches(patches, SEAM_ROTATION),
+        paints,
+        sample_material(draw, 0.2, 0.6),
+        {"inside": 0.25, "base": 0.5},
+    )
+
+
+def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Patch]]:
+    """Create the surface of a bottle; also return the height of its shoulder."""
     radius = draw(3.75, 3.0, 4.8)
     neck = draw(1.35, 1.0, 1.7)
     shoulder = height * draw(0.62, 0.45, 0.68)
@@ -304,6 +329,13 @@ def bottle(draw: ParameterSampler) -> Instance:
     patches = shapes.vessel(outside, draw(0.35, 0.3, 0.45), 0.8, step=1.6, columns=48)
     if capped:
         patches += _cap(draw, wide + 0.12, height)
+    return shoulder, patches
+
+
+def _bottle_paints(
+    draw: ParameterSampler, height: float, shoulder: float
+) -> dict[str, Paint]:
+    """Sample the paints of a bottle."""
     offset = draw.offset()
     glass = draw.sample_color(
         "17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416"
@@ -323,18 +355,12 @@ def bottle(draw: ParameterSampler) -> Instance:
             between(height * 0.8, 2 * height),
             speckled(solid(foil), shade(foil, 1.3), 0.5, offset),
         )
-    paints = {
+    return {
         "outside": outer,
         "inside": solid(shade(glass, 0.6)),
         "base": solid(glass),
         "cap": solid(draw.sample_color("c9a24b", "d0d0d0", "b5442e", "22262b")),
     }
-    return Instance(
-        shapes.transform_patches(patches, SEAM_ROTATION),
-        paints,
-        sample_material(draw, 0.2, 0.6),
-        {"inside": 0.25, "base": 0.5},
-    )
 
 
 def _cap(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
@@ -409,6 +435,30 @@ def _labelled(
 def vase(draw: ParameterSampler) -> Instance:
     """Make a vase, perhaps with handles."""
     height = 24.0
+    belly_at, neck_at, profile, patches = _vase_body(draw, height)
+    patches += _vase_handles(draw, belly_at, neck_at, profile)
+    offset = draw.offset()
+    clay = draw.sample_color("f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a")
+    glaze = clouded(clay, 0.95, 4.0, offset)
+    outer = paint_or_random(draw, height, _vase_paint(draw, glaze, height, offset))
+    paints = {
+        "outside": outer,
+        "inside": solid(shade(clay, 0.8)),
+        "base": solid("b79b7c"),
+        "handle": glaze,
+    }
+    return Instance(
+        shapes.transform_patches(patches, SEAM_ROTATION),
+        paints,
+        sample_material(draw, 0.25, 0.6),
+        {"inside": 0.35, "base": 0.5},
+    )
+
+
+def _vase_body(
+    draw: ParameterSampler, height: float
+) -> tuple[float, float, Array, list[Patch]]:
+    """Create a vase without handles; also return the heights of belly and neck, and its profile."""
     foot = draw(3.6, 2.6, 4.4)
     belly = draw(7.2, 5.2, 8.6)
     belly_at = height * draw(0.52, 0.3, 0.68)
@@ -426,6 +476,14 @@ def vase(draw: ParameterSampler) -> Instance:
     ]
     profile = shapes.spline(knots, 34)
     patches = shapes.vessel(profile, draw(0.4, 0.35, 0.6), 0.8, step=1.2)
+    return belly_at, neck_at, profile, patches
+
+
+def _vase_handles(
+    draw: ParameterSampler, belly_at: float, neck_at: float, profile: Array
+) -> list[Patch]:
+    """Create two handles of a vase, or none."""
+    patches = list[Patch]()
     if draw.chance(0.25):
         low = belly_at + 0.15 * (neck_at - belly_at)
         high = neck_at - 0.2
@@ -434,22 +492,7 @@ def vase(draw: ParameterSampler) -> Instance:
             *shapes.transform_patches(ear, shapes.rotation("z", 130.0)),
             *shapes.transform_patches(ear, shapes.rotation("z", -50.0)),
         ]
-    offset = draw.offset()
-    clay = draw.sample_color("f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a")
-    glaze = clouded(clay, 0.95, 4.0, offset)
-    outer = paint_or_random(draw, height, _vase_paint(draw, glaze, height, offset))
-    paints = {
-        "outside": outer,
-        "inside": solid(shade(clay, 0.8)),
-        "base": solid("b79b7c"),
-        "handle": glaze,
-    }
-    return Instance(
-        shapes.transform_patches(patches, SEAM_ROTATION),
-        paints,
-        sample_material(draw, 0.25, 0.6),
-        {"inside": 0.35, "base": 0.5},
-    )
+    return patches
 
 
 def _vase_paint(
@@ -494,19 +537,27 @@ def wine_glass(draw: ParameterSampler) -> Instance:
     foot = draw(3.5, 2.9, 4.2)
     stem = draw(0.42, 0.32, 0.6)
     stem_top = draw(9.5, 6.0, 12.0)
+    deep, wall, outer = _glass_bowl(draw, stem, stem_top)
+    inner, lip = _glass_lip(outer, wall, stem_top, deep)
+    profile = _glass_profile(stem_top, deep, inner, foot, stem, outer, lip)
+    body = shapes.lathe(profile, 52)
+    paints = _glass_paints(draw, stem_top, deep)
+    return Instance(
+        shapes.transform_patches(body, SEAM_ROTATION),
+        paints,
+        sample_material(draw, 0.18, 0.8, spread=0.12),
+    )
+
+
+def _glass_bowl(
+    draw: ParameterSampler, stem: float, stem_top: float
+) -> tuple[float, float, Array]:
+    """Return the depth of a glass's bowl, the thickness of its wall, and its outer profile."""
     bowl = draw(4.1, 3.2, 5.0)
     deep = draw(9.8, 6.5, 11.5)
     mouth = bowl * draw(0.8, 0.7, 1.12)
     wide_at = draw(0.42, 0.3, 0.55)
     wall = draw(0.24, 0.2, 0.3)
-    under = [(0.0, 0.12), (foot * 0.8, 0.12), (foot * 0.9, 0.0), (foot - 0.15, 0.0)]
-    rising = [
-        (foot, 0.28),
-        (0.55 * foot, 0.6),
-        (0.22 * foot, 1.25),
-        (stem * 1.15, 2.4),
-        (stem, 0.6 * stem_top),
-    ]
     knob = draw.chance(0.25)
     neck = [
         (stem * (2.2 if knob else 1.0), 0.78 * stem_top),
@@ -520,6 +571,13 @@ def wine_glass(draw: ParameterSampler) -> Instance:
         (mouth, stem_top + deep),
     ]
     outer = shapes.spline([(stem, 0.6 * stem_top), *neck, *cup], 36)
+    return deep, wall, outer
+
+
+def _glass_lip(
+    outer: Array, wall: float, stem_top: float, deep: float
+) -> tuple[Array, Array]:
+    """Return the profile of the inside of a glass, and of its lip."""
     normal = np.gradient(outer, axis=0)
     normal = np.stack([normal[:, 1], -normal[:, 0]], axis=1) / np.linalg.norm(
         normal, axis=1, keepdims=True
@@ -530,22 +588,36 @@ def wine_glass(draw: ParameterSampler) -> Instance:
     side = np.array([-normal[-1, 1], normal[-1, 0]])
     curl = np.cos(angle)[:, None] * normal[-1] + np.sin(angle)[:, None] * side
     lip = outer[-1] - wall / 2 * normal[-1] + wall / 2 * curl
+    return inner, lip
+
+
+def _glass_profile(
+    stem_top: float,
+    deep: float,
+    inner: Array,
+    foot: float,
+    stem: float,
+    outer: Array,
+    lip: Array,
+) -> list[tuple[str, Array]]:
+    """Return the tags and profiles of the parts of a wine glass."""
     floor = stem_top + 0.08 * deep
     edge = (inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))
-    profile = [
+    under = [(0.0, 0.12), (foot * 0.8, 0.12), (foot * 0.9, 0.0), (foot - 0.15, 0.0)]
+    rising = [
+        (foot, 0.28),
+        (0.55 * foot, 0.6),
+        (0.22 * foot, 1.25),
+        (stem * 1.15, 2.4),
+        (stem, 0.6 * stem_top),
+    ]
+    return [
         ("foot", shapes.subdivide(under, 1.5)),
         ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, 14)])),
         ("bowl", np.concatenate([outer, lip, inner[:1]])),
         ("inside", inner),
         ("inside", np.array([inner[-1], edge, (0.0, floor)])),
     ]
-    body = shapes.lathe(profile, 52)
-    paints = _glass_paints(draw, stem_top, deep)
-    return Instance(
-        shapes.transform_patches(body, SEAM_ROTATION),
-        paints,
-        sample_material(draw, 0.18, 0.8, spread=0.12),
-    )
 
 
 def _glass_paints(
