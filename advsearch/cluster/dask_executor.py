@@ -198,8 +198,8 @@ class DaskExecutor(WorkerExecutor):
                 time.sleep(LOOK_SECONDS)
         self._connection = self._client.scheduler_comm
         # what Dask draws its pages with
-        drawn = importlib.util.find_spec("bokeh") is not None
-        self.link = str(self._client.dashboard_link or "") if drawn else ""
+        has_pages = importlib.util.find_spec("bokeh") is not None
+        self.link = str(self._client.dashboard_link or "") if has_pages else ""
         if self.link:
             self._tell(f"Dask shows its workers at {self.link}")
 

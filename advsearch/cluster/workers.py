@@ -111,9 +111,7 @@ class PoolWorkers:
                     raise error
                 elif len(items) > 1:
                     self._count_dead_start()
-                    # item by item, in the same order
-                    for index in range(len(items) - 1, -1, -1):
-                        waiting.appendleft(items[index : index + 1])
+                    _requeue_singly(items, waiting)
                 else:
                     self._count_dead_start()
                     yield BatchResult(items, None, lost=str(error))
@@ -191,6 +189,13 @@ class PoolWorkers:
                 "try it with workers=null, or see whether a worker has enough memory "
                 "for the scene and the model"
             )
+
+
+def _requeue_singly(items: Sequence[Any], waiting: deque[Sequence[Any]]) -> None:
+    """Put the items of a batch back to the front of a queue, each by itself."""
+    # item by item, in the same order
+    for index in range(len(items) - 1, -1, -1):
+        waiting.appendleft(items[index : index + 1])
 
 
 def _error_of(future: Future[Reply]) -> BaseException | None:

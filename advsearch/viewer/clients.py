@@ -49,9 +49,11 @@ def find_reachable_address(host: str) -> str:
     if host not in ("0.0.0.0", "::", ""):
         return host
     # addresses of documentation, RFC 3849 and RFC 5737
-    family, remote = socket.AF_INET, "192.0.2.1"
+    family = socket.AF_INET
+    remote = "192.0.2.1"
     if host == "::":
-        family, remote = socket.AF_INET6, "2001:db8::1"
+        family = socket.AF_INET6
+        remote = "2001:db8::1"
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect((remote, 9))  # chooses an address; nothing is sent

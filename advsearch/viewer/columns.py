@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import math
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
 from advsearch.options import OUT_OF_VIEW
@@ -162,19 +163,7 @@ def pack_columns(
     columns |= _box_columns(rows)
     arrays = sorted(columns.items(), key=lambda item: -item[1].itemsize)
 
-    layout = list[dict[str, object]]()
-    offset = 0
-    for name, values in arrays:
-        entry: dict[str, object] = {
-            "name": name,
-            "type": values.dtype.name,
-            "at": offset,
-            "width": values.size // max(len(values), 1),
-        }
-        if name == "others":
-            entry["length"] = values.size
-        layout.append(entry)
-        offset += values.nbytes
+    layout = _make_layout(arrays)
     boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
     head = {
         "count": len(rows),
@@ -193,6 +182,26 @@ def pack_columns(
         values.astype(values.dtype.newbyteorder("<")).tobytes() for _, values in arrays
     ]
     return b"".join([len(head_data).to_bytes(4, "little"), head_data, *data])
+
+
+def _make_layout(
+    arrays: Sequence[tuple[str, npt.NDArray[Any]]],
+) -> list[dict[str, object]]:
+    """Return the name, the type, the offset and the width of each column."""
+    layout = list[dict[str, object]]()
+    offset = 0
+    for name, values in arrays:
+        entry: dict[str, object] = {
+            "name": name,
+            "type": values.dtype.name,
+            "at": offset,
+            "width": values.size // max(len(values), 1),
+        }
+        if name == "others":
+            entry["length"] = values.size
+        layout.append(entry)
+        offset += values.nbytes
+    return layout
 
 
 def _prediction_columns(

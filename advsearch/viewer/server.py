@@ -192,29 +192,17 @@ def make_progress_page(name: str, run: Path) -> str:
     if listed.state == "running":
         state = "A process is working on it."
     counts = [f"{count} of {kind}" for kind, count in listed.kinds.items()]
-    attacks = []
-    for path in sorted((run / PARTS).glob("*")):  # attacks of a study
-        if path.is_dir():
-            address = f"{PARTS}/{quote_name(path.name)}/{REPORT}"
-            link = element("a", path.name, href=address)
-            has_page = (path / REPORT).is_file()
-            attacks.append(element("li", link if has_page else path.name))
     header = element(
         "header",
         element("p", ", ".join(filter(None, facts)), class_="eyebrow"),
         element("h1", f"{name} has not ended"),
     )
-    attack_list = None
-    if attacks:
-        attack_list = element(
-            "div", element("h2", "Its attacks"), element("ul", *attacks)
-        )
     state_text = f"{state} Evaluations so far: {', '.join(counts) or 'none'}."
     main = element(
         "main",
         element("p", state_text, id="state"),
         element("div", id="follow"),
-        attack_list,
+        _attack_list_html(run),
     )
     return make_document(
         name,
@@ -225,6 +213,20 @@ def make_progress_page(name: str, run: Path) -> str:
         connects=True,
         footer=f"run {name}",
     )
+
+
+def _attack_list_html(run: Path) -> Html | None:
+    """Return the list of a study's attacks with links to their pages; None without any."""
+    attacks = []
+    for path in sorted((run / PARTS).glob("*")):  # attacks of a study
+        if path.is_dir():
+            address = f"{PARTS}/{quote_name(path.name)}/{REPORT}"
+            link = element("a", path.name, href=address)
+            has_page = (path / REPORT).is_file()
+            attacks.append(element("li", link if has_page else path.name))
+    if not attacks:
+        return None
+    return element("div", element("h2", "Its attacks"), element("ul", *attacks))
 
 
 def make_progress_json(run: Path, after: int) -> bytes:

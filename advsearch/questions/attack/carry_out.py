@@ -51,9 +51,9 @@ from advsearch.progress import Progress
 from advsearch.questions.attack.ambient import make_problem_finder
 from advsearch.questions.attack.settings import (
     SIZE_OVER_NUMBERS,
-    SIZE_OVER_ONE_NUMBER,
     SIZE_OVER_PREDICTED,
     SIZE_OVER_RENDERED,
+    SIZE_OVER_SINGLE_PARAMETER,
     STEPS,
     AttackConfig,
 )
@@ -325,10 +325,7 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
     )
     if note:
         warnings.append(note)
-    if config.printable:
-        searched_space = make_space(parts.controls, description)
-        # raises where nothing can be printed
-        judging.measure_print_terms(searched_space, searched_space.start)
+    _check_printable(parts, config, description)
     problem = Problem(
         renderer,
         space,
@@ -342,13 +339,26 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
         aovs=parse_aovs(config.aov),
         metrics=parts.metrics,
     )
+    _check_objective_inputs(parts, problem)
+    problem.steps, problem.n_draws = choose_search_size(config, problem)
+    return problem
+
+
+def _check_printable(parts: AttackParts, config: SceneConfig, description: Any) -> None:
+    """Raise an error if colors are to be printed and nothing can be."""
+    if config.printable:
+        searched_space = make_space(parts.controls, description)
+        # raises where nothing can be printed
+        judging.measure_print_terms(searched_space, searched_space.start)
+
+
+def _check_objective_inputs(parts: AttackParts, problem: Problem) -> None:
+    """Raise an error if the objective requests what the problem does not have."""
     for name in list_requested_inputs(parts.objective):
         # raises where the objective needs what there is not
         problem.make_objective_inputs(problem.add_conditions(problem.domain.start))(
             name
         )
-    problem.steps, problem.n_draws = choose_search_size(config, problem)
-    return problem
 
 
 def _bind_task(
@@ -414,7 +424,7 @@ def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int
         return config.steps or STEPS, 1
     default = SIZE_OVER_PREDICTED
     if problem.conditions.dim == 1:
-        default = SIZE_OVER_ONE_NUMBER
+        default = SIZE_OVER_SINGLE_PARAMETER
     steps = config.steps or default[0]
     if find_matrix_refusal(problem, steps, config.specialise) is not None:
         # Conditions are rendered.

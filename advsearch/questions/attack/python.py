@@ -109,9 +109,7 @@ def attack(
         resume: go on with the run of that name, if there is one, where it was stopped;
             everything else has to be as it was.
     """
-    options: dict[str, Any] = {
-        name: value for name, value in settings.items() if value is not None
-    }
+    options = _drop_unset(settings)
     if callable(task):
         task = make_task(task)
     if not isinstance(policy, (str, Mapping, Policy)) or not policy:
@@ -123,35 +121,11 @@ def attack(
         *loading.list_session_only_controls(controls),
         *loading.list_session_only_controls(over),
     ]
-    are_named = all(
-        isinstance(value, (str, Path)) for value in (scene, *list_models(model))
-    )
-    if (
-        not are_named
-        or callable(objective)
-        or session_controls
-        or isinstance(task, FunctionTask)
-    ):
-        naming.check_no_worker_settings(options)
+    _check_can_use_workers(scene, model, task, objective, session_controls, options)
     scene = _load_scene(scene, object, options)
 
-    # What `run.yaml` states. Objects of the caller have the names that they are shown
-    # by.
-    objective_name = _name_objective(objective) if callable(objective) else objective
-    described = {
-        **loading.scene_to_settings(scene),
-        "model": ",".join(map(get_model_name, list_models(model))),
-        "controls": loading.controls_to_settings(controls),
-        "over": loading.controls_to_settings(over),
-        "task": to_setting(task) if isinstance(task, Task) else task,
-        "objective": objective_name,
-        "policy": to_setting(policy) if isinstance(policy, Policy) else policy,
-        "metrics": judging.metrics_to_settings(metrics or {}),
-    }
-    if options.get("exposure"):  # the option says it
-        described["set"].pop("camera.exposure", None)
-    config = AttackConfig(
-        **{**described, **options, "run": None if run is None else str(run)}
+    config = _make_config(
+        scene, model, task, controls, objective, policy, over, metrics, run, options
     )
     losses.check_direction(objective, targeted=config.target is not None)
 
@@ -169,12 +143,7 @@ def attack(
         task if isinstance(task, Task) else config.task,
         objective if callable(objective) else config.objective,
     )
-    resumed = None
-    if resume and run is not None and is_run(run_path(run)):
-        resumed = run_path(run)
-    context: Any = nullcontext(resumed)
-    if run is not None and resumed is None:
-        context = begun(config)
+    context = _open_run(run, resume, config)
     with context as directory:
         parts = AttackParts(
             config,
@@ -189,6 +158,79 @@ def attack(
             metrics=judging.load_metrics(config.metrics, metrics),
         )
         return run_attack(parts, watcher(progress), directory)
+
+
+def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:
+    """Return the settings that are not None."""
+    options: dict[str, Any] = {
+        name: value for name, value in settings.items() if value is not None
+    }
+    return options
+
+
+def _check_can_use_workers(
+    scene: Scene | str | Path | Mapping[str, object],
+    model: AnyModel | Sequence[AnyModel],
+    task: str | Mapping[str, object] | Task,
+    objective: str | Callable[..., Tensor] | None,
+    session_controls: Sequence[Any],
+    options: Mapping[str, Any],
+) -> None:
+    """Raise an error if workers are requested for objects that they cannot load."""
+    are_named = all(
+        isinstance(value, (str, Path)) for value in (scene, *list_models(model))
+    )
+    if (
+        not are_named
+        or callable(objective)
+        or session_controls
+        or isinstance(task, FunctionTask)
+    ):
+        naming.check_no_worker_settings(options)
+
+
+def _make_config(
+    scene: Scene,
+    model: AnyModel | Sequence[AnyModel],
+    task: Any,
+    controls: Controls,
+    objective: str | Callable[..., Tensor] | None,
+    policy: str | Mapping[str, object] | Policy[Any],
+    over: Controls,
+    metrics: Mapping[str, str | Metric] | None,
+    run: str | Path | None,
+    options: dict[str, Any],
+) -> AttackConfig:
+    """Return the settings of an attack, with the names of the caller's objects."""
+    # What `run.yaml` states. Objects of the caller have the names that they are shown
+    # by.
+    objective_name = _name_objective(objective) if callable(objective) else objective
+    described = {
+        **loading.scene_to_settings(scene),
+        "model": ",".join(map(get_model_name, list_models(model))),
+        "controls": loading.controls_to_settings(controls),
+        "over": loading.controls_to_settings(over),
+        "task": to_setting(task) if isinstance(task, Task) else task,
+        "objective": objective_name,
+        "policy": to_setting(policy) if isinstance(policy, Policy) else policy,
+        "metrics": judging.metrics_to_settings(metrics or {}),
+    }
+    if options.get("exposure"):  # the option says it
+        described["set"].pop("camera.exposure", None)
+    return AttackConfig(
+        **{**described, **options, "run": None if run is None else str(run)}
+    )
+
+
+def _open_run(run: str | Path | None, resume: bool, config: AttackConfig) -> Any:
+    """Return a context with the run directory: a stopped run's, a new one's, or None."""
+    resumed = None
+    if resume and run is not None and is_run(run_path(run)):
+        resumed = run_path(run)
+    context: Any = nullcontext(resumed)
+    if run is not None and resumed is None:
+        context = begun(config)
+    return context
 
 
 def _find_python_only(

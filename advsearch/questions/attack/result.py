@@ -326,17 +326,25 @@ class StoredImage:
         """
         if trial is None:
             seed = seeds.stream(problem.seed, "pictures")
-            whole = problem.add_conditions(u, None)
+            configuration = problem.add_conditions(u, None)
             spp = UNTRIED_SPP
         else:
             seed = seeds.stream(problem.seed, "verification", trial)
-            whole = problem.add_conditions(u, seed)
+            configuration = problem.add_conditions(u, seed)
             spp = findings.spp
         with torch.no_grad():
-            radiance = problem.renderer.radiance(whole, seed, spp)
+            radiance = problem.renderer.radiance(configuration, seed, spp)
             display = problem.renderer.formation.display(radiance)
-            picture = round_to_8_bit(problem.space.apply_to_image(whole, display))
-        return cls(whole, radiance, picture, problem.judge(picture, whole), trial)
+            picture = round_to_8_bit(
+                problem.space.apply_to_image(configuration, display)
+            )
+        return cls(
+            configuration,
+            radiance,
+            picture,
+            problem.judge(picture, configuration),
+            trial,
+        )
 
 
 def choose_stored_trial(findings: RunState) -> int | None:
@@ -501,11 +509,26 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
             near_shapes.append(shape)
         return near_shapes
 
+    to_world = _find_camera_pose(adversarial, scene)
+    note = _describe_simplified(meshes, simplify)
+    glb = encode_web_glb(make_shapes(adversarial), make_shapes(clean), to_world, note)
+    write_bytes(run.path / OBJECT_FILE, glb)
+
+
+def _find_camera_pose(
+    adversarial: Mapping[str, Tensor], scene: Any
+) -> npt.NDArray[np.float64]:
+    """Return the camera's pose (4, 4): the one that a control set, or the scene's."""
     camera_pose = adversarial.get("camera.to_world")
     if camera_pose is None:
         to_world = camera_to_world(scene)
     else:
         to_world = camera_pose.double().numpy()
+    return to_world
+
+
+def _describe_simplified(meshes: Sequence[Any], simplify: Mapping[str, object]) -> str:
+    """Describe which meshes have fewer faces in the browser; empty if none has."""
     simplified = [
         f"{len(part.mesh.faces):,} of {part.name}"
         for part in meshes
@@ -514,8 +537,7 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     note = ""
     if simplified:
         note = f"It is shown with fewer faces than it has ({', '.join(simplified)})."
-    glb = encode_web_glb(make_shapes(adversarial), make_shapes(clean), to_world, note)
-    write_bytes(run.path / OBJECT_FILE, glb)
+    return note
 
 
 def _assemble(problem: Problem, u: Tensor) -> Mapping[str, Tensor]:

@@ -111,13 +111,7 @@ def run_attack(
         stages = Stages(progress)
         stages.begin("setup", PREPARING)
         problem = make_problem(parts)
-        warnings = [
-            *problem.space.list_notes(parts.scene.description),
-            *loading_notes,
-            *describe_adjusted_defaults(problem.space.adjusted_defaults),
-        ]
-        for text in warnings:
-            progress.message(text)
+        warnings = _report_warnings(parts, progress, problem, loading_notes)
         policy = choose_policy(parts.policy, problem, _gradient_setting(config))
         if run is None and parts.is_stored:
             run = stack.enter_context(RunDirectory.of(config))
@@ -126,33 +120,8 @@ def run_attack(
         with open_executor(config, WORKER, progress) as executor:
             # replays stored rows, renders and stores the others
             journal = Journal(run, ParallelEvaluator(problem, executor))
-            is_size_chosen = config.steps is None or config.draws is None
-            if problem.conditions is not None and is_size_chosen:
-                progress.message(
-                    "One configuration for many conditions: "
-                    f"{count(problem.steps, 'step')}, each over "
-                    f"{count(problem.n_draws, 'condition')}; `steps` and `draws` change "
-                    "that."
-                )
-            has_trial_count = config.trials is not None or config.smallest
-            findings = search_and_verify(
-                policy,
-                journal,
-                stages,
-                clean=parts.clean_matrix,
-                smallest=config.smallest,
-                seconds=config.seconds,
-                baseline=config.baseline,
-                printable=config.printable,
-                close_looks=config.max_extra_repeats,
-                average=config.average,
-                trials=config.trial_count if has_trial_count else None,
-                ladder=choose_ladder(config.verify_spp, config.pixel_sampler),
-                specialise=config.specialise,
-                measure=config.measure,
-                deterministic=config.deterministic,
-                chooses_spp=config.spp is None,
-            )
+            _report_search_size(progress, config, problem)
+            findings = _search(parts, config, policy, journal, stages)
         if isinstance(problem.model.module, RemoteNetwork):
             warnings.append(problem.model.module.spending_sentence)
         result = make_result(
@@ -173,6 +142,66 @@ def run_attack(
         # without the matrix of light transport, which may be large
         stored_parts = replace(parts, clean_matrix=CleanMatrix())
         return replace(result, parts=lambda: stored_parts)
+
+
+def _report_warnings(
+    parts: AttackParts,
+    progress: Progress,
+    problem: Problem,
+    loading_notes: Sequence[str],
+) -> list[str]:
+    """Report and return the warnings of loading and of the controls."""
+    warnings = [
+        *problem.space.list_notes(parts.scene.description),
+        *loading_notes,
+        *describe_adjusted_defaults(problem.space.adjusted_defaults),
+    ]
+    for text in warnings:
+        progress.message(text)
+    return warnings
+
+
+def _report_search_size(
+    progress: Progress, config: AttackConfig, problem: Problem
+) -> None:
+    """Report how many steps and conditions were chosen for a search over conditions."""
+    is_size_chosen = config.steps is None or config.draws is None
+    if problem.conditions is not None and is_size_chosen:
+        progress.message(
+            "One configuration for many conditions: "
+            f"{count(problem.steps, 'step')}, each over "
+            f"{count(problem.n_draws, 'condition')}; `steps` and `draws` change "
+            "that."
+        )
+
+
+def _search(
+    parts: AttackParts,
+    config: AttackConfig,
+    policy: Policy[Any],
+    journal: Journal,
+    stages: Stages,
+) -> Any:
+    """Search for the worst configuration with the settings of the attack, and verify it."""
+    has_trial_count = config.trials is not None or config.smallest
+    return search_and_verify(
+        policy,
+        journal,
+        stages,
+        clean=parts.clean_matrix,
+        smallest=config.smallest,
+        seconds=config.seconds,
+        baseline=config.baseline,
+        printable=config.printable,
+        close_looks=config.max_extra_repeats,
+        average=config.average,
+        trials=config.trial_count if has_trial_count else None,
+        ladder=choose_ladder(config.verify_spp, config.pixel_sampler),
+        specialise=config.specialise,
+        measure=config.measure,
+        deterministic=config.deterministic,
+        chooses_spp=config.spp is None,
+    )
 
 
 def search_and_verify(

@@ -24,7 +24,7 @@ TRIALS = 20
 TRIALS_OVER = 200
 STEPS = 40  # Of a search about one picture
 SIZE_OVER_PREDICTED = (300, 8)
-SIZE_OVER_ONE_NUMBER = (100, 4)
+SIZE_OVER_SINGLE_PARAMETER = (100, 4)
 SIZE_OVER_RENDERED = (150, 4)
 SIZE_OVER_NUMBERS = (STEPS, 4)
 """Steps of a search for many conditions, and conditions that each evaluates: if a bank
@@ -179,7 +179,7 @@ class AttackConfig(DerivativeConfig):
         "number of search steps, each of which evaluates one configuration",
         otherwise=f"{STEPS}; for textures and the like with --over {SIZE_OVER_PREDICTED[0]} "
         "where pictures are predicted, "
-        f"{SIZE_OVER_ONE_NUMBER[0]} where one number varies, as along a path, and "
+        f"{SIZE_OVER_SINGLE_PARAMETER[0]} where one number varies, as along a path, and "
         f"{SIZE_OVER_RENDERED[0]} where they are rendered",
         ge=1,
         le=1_000_000,
@@ -406,10 +406,10 @@ class AttackConfig(DerivativeConfig):
         return TRIALS_OVER if self.over else TRIALS
 
 
-def parse_instance(asked: str) -> str:
+def parse_instance(parameter_name: str) -> str:
     """Return the instance in the name of a parameter.
 
     `light:key` for itself, `camera` for `camera.azimuth`.
     """
-    kind, colon, name = asked.partition(":")
+    kind, colon, name = parameter_name.partition(":")
     return kind.partition(".")[0] + colon + name.partition(".")[0]

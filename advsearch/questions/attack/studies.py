@@ -21,7 +21,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cluster import BatchFunction, WorkerTask
+from advsearch.cluster import BatchFunction, BatchResult, WorkerTask
 from advsearch.cluster.workers import open_workers
 from advsearch.engine.journal import make_worker_call
 from advsearch.engine.judging import find_label_warnings
@@ -209,19 +209,22 @@ def distribute_attacks(
             return
         progress.stage("attacks on workers", len(missing))
         for done in executor.compute([index] for index in missing):
-            if done.lost:
-                lost_attack = chains[done.items[0]][0]
-                title = lost_attack.config.object
-                if lost_attack.of != title:
-                    title += f" with {lost_attack.of}"
-                raise ClusterError(
-                    f"{title}: {done.lost}; leave it out, or go on without it"
-                )
+            _check_not_lost(chains, done)
             for name, worker_path, files in done.value:
                 _write_part(run, name, worker_path, files)
             facts = executor.stats
             values = {} if facts is None else {"workers": facts.workers}
             progress.advance(1, **values)
+
+
+def _check_not_lost(chains: Sequence[Chain], done: BatchResult) -> None:
+    """Raise an error if the worker of an attack died."""
+    if done.lost:
+        lost_attack = chains[done.items[0]][0]
+        title = lost_attack.config.object
+        if lost_attack.of != title:
+            title += f" with {lost_attack.of}"
+        raise ClusterError(f"{title}: {done.lost}; leave it out, or go on without it")
 
 
 def _write_part(
@@ -517,11 +520,7 @@ def _try_on_models(
     """
     config = study.context.config
     study.progress.stage("loading the models to try the scenes on")
-    conditions = []
-    for name in names:
-        problem, _ = problem_from_config(_with_model(config, name))
-        resolution = problem.renderer.formation.resolution
-        conditions.append(RetrialCondition(name, problem, spp, resolution))
+    conditions = _make_conditions(names, spp, config)
     worker = "advsearch.questions.attack.studies:models_worker"
     with open_executor(config, worker, study.progress) as executor:
         retrials = Retrials(
@@ -553,6 +552,18 @@ def _try_on_models(
                     conditions, verifications, strict=True
                 )
             ]
+
+
+def _make_conditions(
+    names: Sequence[str], spp: int, config: AttackConfig
+) -> list[RetrialCondition]:
+    """Return the conditions of trials on models: one for each."""
+    conditions = []
+    for name in names:
+        problem, _ = problem_from_config(_with_model(config, name))
+        resolution = problem.renderer.formation.resolution
+        conditions.append(RetrialCondition(name, problem, spp, resolution))
+    return conditions
 
 
 def _try_clean(retrials: Retrials, condition: RetrialCondition) -> MatrixModel:

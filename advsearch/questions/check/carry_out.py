@@ -228,11 +228,7 @@ class GradientCheck:
         renderer = problem.renderer
         bench = self._make_bench(part, renderer, problem.compute_loss, problem.spp)
 
-        n_gradients = planning.plan_gradients(renderer.plan)
-        stage_title = f"{title}: comparing ways to differentiate"
-        self.progress.stage(stage_title, n_gradients, hint=HINT)
-        measure_bench = replace(bench, seed=seeds.stream(config.seed, "measure"))
-        renderer.plan = planning.measured_plan(measure_bench, count_renders=True)
+        self._choose_plan(title, renderer, bench, config)
 
         planned_steps = {group.name: group.step for group in renderer.plan.groups}
         rows = list[results.Measured]()
@@ -259,6 +255,14 @@ class GradientCheck:
             # Coordinates of one group have a number after its name.
             group_name = f"{row.control}.{row.parameter.partition('.')[0]}"
             yield part.make_row(row, factor=step_factors.get(group_name, 1.0))
+
+    def _choose_plan(self, title: str, renderer: Any, bench: Any, config: Any) -> None:
+        """Measure ways to differentiate, and set the renderer's plan to the best."""
+        n_gradients = planning.plan_gradients(renderer.plan)
+        stage_title = f"{title}: comparing ways to differentiate"
+        self.progress.stage(stage_title, n_gradients, hint=HINT)
+        measure_bench = replace(bench, seed=seeds.stream(config.seed, "measure"))
+        renderer.plan = planning.measured_plan(measure_bench, count_renders=True)
 
     def _measure_cosines(
         self, problem: Problem, bench: gradients.Bench, seed: int, title: str

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -60,17 +60,7 @@ class PairImages:
             row: [f"images/pair-{pair}-{row}-{letter}.jpg" for letter in sides]
             for row in rows
         }
-        missing = []
-        with self.context.until_interrupted():
-            for row in rows:
-                for side, file in zip(sides.values(), files[row], strict=True):
-                    number = int(side.rows["number"][row])
-                    stored = side.sweep.find_thumbnail(number)
-                    if stored is not None:
-                        run.write_file(file, stored.read_bytes())
-                    elif not (run.path / file).is_file():
-                        missing.append(MissingImage(side, number, file))
-            self._render(missing)
+        self._save_images(rows, sides, files, run)
         for row in rows:
             values = first.rows.loc[row, first.varying_parameters].items()
             is_complete = all((run.path / file).is_file() for file in files[row])
@@ -84,6 +74,26 @@ class PairImages:
                 answers=(first.rows["label"][row], second.rows["label"][row]),
                 pictures=files[row] if is_complete else [],
             )
+
+    def _save_images(
+        self,
+        rows: Sequence[int],
+        sides: Mapping[str, Side],
+        files: Mapping[int, Sequence[str]],
+        run: Any,
+    ) -> None:
+        """Store the images of rows: thumbnails of the sweeps, or else renderings."""
+        missing = []
+        with self.context.until_interrupted():
+            for row in rows:
+                for side, file in zip(sides.values(), files[row], strict=True):
+                    number = int(side.rows["number"][row])
+                    stored = side.sweep.find_thumbnail(number)
+                    if stored is not None:
+                        run.write_file(file, stored.read_bytes())
+                    elif not (run.path / file).is_file():
+                        missing.append(MissingImage(side, number, file))
+            self._render(missing)
 
     def _render(self, missing: Sequence[MissingImage]) -> None:
         """Render images again, sweep by sweep, so that each scene is loaded once."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from advsearch.extend import (
     Config,
@@ -108,37 +108,19 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
             rows are read together; of a recipe, its sweeps.
     """
     # these import torch, scipy and pandas
-    from advsearch.extend import rules, workbench
     from advsearch.questions.explain import findings
-    from advsearch.questions.explain.envelope import find_envelope
-    from advsearch.questions.explain.importance import find_importance
     from advsearch.questions.explain.renders import Renders
 
     config = context.config
     progress = context.progress
     progress.stage("reading rows")
-    sweeps = [
-        workbench.StoredSweep.read(path)
-        for name in settings.split_names(config.sweeps)
-        for path in find_sweeps(directory.find_run(name))
-    ]
+    sweeps = _read_sweeps(config)
     rows, table = read_table(sweeps)
 
-    choosing, counting = rules.split_in_halves(table, config.seed)
-    progress.stage("seeking rules on one half of the rows")
-    found_rules = rules.find_rules(choosing, counting, config.seed)
-    progress.stage("measuring which parameters matter")
-    importance = find_importance(table)
-    envelope = find_envelope(choosing, counting, config.accuracy)
+    found_rules, importance, envelope = _analyze_rows(table, config, progress)
 
     renders = Renders(context, sweeps, rows, table)
-    rule_rows = [
-        RuleRow(
-            **findings.describe_rule(rule),
-            confirmed=renders.confirm_rule(found_rules.accepted, index),
-        )
-        for index, rule in enumerate(found_rules.accepted)
-    ]
+    rule_rows = _confirm_rules(renders, found_rules)
     pairs = list(renders.find_pairs(found_rules.accepted))
     clusters = renders.find_clusters()
     if renders.interrupted:
@@ -163,6 +145,47 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
         renders=renders.n_renders,
         warnings=[*renders.warnings, *findings.find_row_warnings(table, importance)],
     )
+
+
+def _read_sweeps(config: ExplainConfig) -> list[StoredSweep]:
+    """Read the rows of the sweeps that the settings name."""
+    from advsearch.extend import workbench
+
+    return [
+        workbench.StoredSweep.read(path)
+        for name in settings.split_names(config.sweeps)
+        for path in find_sweeps(directory.find_run(name))
+    ]
+
+
+def _analyze_rows(
+    table: Any, config: ExplainConfig, progress: Any
+) -> tuple[Any, Any, Any]:
+    """Find rules, the importance of parameters, and the envelope of right predictions."""
+    from advsearch.extend import rules
+    from advsearch.questions.explain.envelope import find_envelope
+    from advsearch.questions.explain.importance import find_importance
+
+    choosing, counting = rules.split_in_halves(table, config.seed)
+    progress.stage("seeking rules on one half of the rows")
+    found_rules = rules.find_rules(choosing, counting, config.seed)
+    progress.stage("measuring which parameters matter")
+    importance = find_importance(table)
+    envelope = find_envelope(choosing, counting, config.accuracy)
+    return found_rules, importance, envelope
+
+
+def _confirm_rules(renders: Any, found_rules: Any) -> list[RuleRow]:
+    """Render configurations inside each rule, and describe the rules."""
+    from advsearch.questions.explain import findings
+
+    return [
+        RuleRow(
+            **findings.describe_rule(rule),
+            confirmed=renders.confirm_rule(found_rules.accepted, index),
+        )
+        for index, rule in enumerate(found_rules.accepted)
+    ]
 
 
 def read_table(sweeps: Sequence[StoredSweep]) -> tuple[pd.DataFrame, pd.DataFrame]:

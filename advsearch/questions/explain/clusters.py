@@ -56,14 +56,7 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     points = decomposition.PCA(n_components, random_state=0).fit_transform(directions)
 
     silhouette, cluster = cluster_points(points)
-    generator = np.random.default_rng(seed)
-    spread = points.std(axis=0)
-    references = (
-        generator.standard_normal(points.shape) * spread for _ in range(N_REFERENCES)
-    )
-    is_apart = all(
-        cluster_points(reference)[0] < silhouette for reference in references
-    )
+    is_apart = _is_clearer_than_noise(seed, points, silhouette)
 
     members = [
         sort_by_distance(points, np.flatnonzero(cluster == k))
@@ -73,6 +66,16 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     if len(members) < 2:
         return Clusters(tuple(members), None, False)
     return Clusters(tuple(members), silhouette, is_apart)
+
+
+def _is_clearer_than_noise(seed: int, points: FloatArray, silhouette: float) -> bool:
+    """Return whether points have a higher silhouette than each reference of random points."""
+    generator = np.random.default_rng(seed)
+    spread = points.std(axis=0)
+    references = (
+        generator.standard_normal(points.shape) * spread for _ in range(N_REFERENCES)
+    )
+    return all(cluster_points(reference)[0] < silhouette for reference in references)
 
 
 def sort_by_distance(points: FloatArray, members: IntArray) -> tuple[int, ...]:

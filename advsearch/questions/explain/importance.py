@@ -192,11 +192,7 @@ class ClusteredPredictions:
         if self.is_independent:
             return float(n_groups - 1)
 
-        n_correct = np.bincount(group, self.weight * self.correct)
-        group_rate = np.divide(
-            n_correct, group_weight, out=np.zeros(len(group_weight)), where=is_used
-        )
-        residual = self.weight * (self.correct - group_rate[group])
+        residual = self._weighted_residual(group, group_weight, is_used)
 
         # A cell is a cluster inside a group.
         cell_id, cell = np.unique(
@@ -220,14 +216,30 @@ class ClusteredPredictions:
         within_groups = within_group_variance(
             squared_residual, clusters_per_group, group_weight[is_used]
         )
-        cluster_residual = np.bincount(cell_cluster, cell_residual)
-        sum_of_squares = float((cluster_residual**2).sum())
-        between_clusters = (
-            sum_of_squares * self.n_clusters / (self.n_clusters - 1) / len(self.correct)
-        )
+        between_clusters = self._between_cluster_variance(cell_cluster, cell_residual)
         return max(
             (within_groups - between_clusters) / self.variance,
             MIN_INFLATION * float(n_groups - 1),
+        )
+
+    def _weighted_residual(
+        self, group: IntArray, group_weight: FloatArray, is_used: BoolArray
+    ) -> FloatArray:
+        """Return the weighted difference (n,) of each prediction from the rate of its group."""
+        n_correct = np.bincount(group, self.weight * self.correct)
+        group_rate = np.divide(
+            n_correct, group_weight, out=np.zeros(len(group_weight)), where=is_used
+        )
+        return self.weight * (self.correct - group_rate[group])
+
+    def _between_cluster_variance(
+        self, cell_cluster: IntArray, cell_residual: FloatArray
+    ) -> float:
+        """Return the variance between clusters, for each row."""
+        cluster_residual = np.bincount(cell_cluster, cell_residual)
+        sum_of_squares = float((cluster_residual**2).sum())
+        return (
+            sum_of_squares * self.n_clusters / (self.n_clusters - 1) / len(self.correct)
         )
 
     def interaction_p_value(

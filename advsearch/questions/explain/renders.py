@@ -134,6 +134,23 @@ class Renders:
             MIN_UNCOVERED_FRACTION,
         )
 
+        fresh_frames = self._render_inside(index, rule, rest, earlier_conditions)
+
+        fresh_rows = pd.concat(fresh_frames) if fresh_frames else self.rows[:0]
+        if fresh_rows.empty:
+            return None
+        elsewhere = rule.elsewhere.assign(unit=rule.elsewhere["unit"].astype(str))
+        fresh_rule = rules.CountedRule(rule.conditions, fresh_rows, elsewhere)
+        return Confirmation(**vars(count_right(fresh_rows)), held=fresh_rule.holds)
+
+    def _render_inside(
+        self,
+        index: int,
+        rule: rules.CountedRule,
+        rest: float,
+        earlier_conditions: Sequence[rules.RuleConditions],
+    ) -> list[pd.DataFrame]:
+        """Render fresh configurations inside a rule in the scene of each sweep."""
         fresh_frames = []
         for sweep_index, sweep in enumerate(self.sweeps):
             n_arcs = count_arcs(sweep.config, rule.conditions)
@@ -157,13 +174,7 @@ class Renders:
                 inside = select_inside(rows, rule.conditions, earlier_conditions)
                 unit = inside["unit"].astype(str) + f" of {part}"
                 fresh_frames.append(inside.assign(unit=unit))
-
-        fresh_rows = pd.concat(fresh_frames) if fresh_frames else self.rows[:0]
-        if fresh_rows.empty:
-            return None
-        elsewhere = rule.elsewhere.assign(unit=rule.elsewhere["unit"].astype(str))
-        fresh_rule = rules.CountedRule(rule.conditions, fresh_rows, elsewhere)
-        return Confirmation(**vars(count_right(fresh_rows)), held=fresh_rule.holds)
+        return fresh_frames
 
     # ---- pairs
     # ------------------------------------------------------------------------------
@@ -232,14 +243,7 @@ class Renders:
         is_right = np.asarray(first["correct"] & second["correct"])
         if not is_right.any() or first["correct"][start] or second["correct"][start]:
             return None
-        right_indices = np.flatnonzero(is_right).tolist()
-        if self.table[factor].dtype == "category":
-            nearest = right_indices[0]
-        else:
-            nearest = min(
-                right_indices,
-                key=lambda index: abs(float(values[index]) - float(wrong_value)),
-            )
+        nearest = self._find_nearest_value(factor, is_right, values, wrong_value)
         return NearestRight(
             values=row,
             parameter=factor,
@@ -250,6 +254,20 @@ class Renders:
             answered_there=first["label"][nearest],
             pictures=self._list_thumbnails(f"{label}-0", (start, nearest)),
         )
+
+    def _find_nearest_value(
+        self, factor: str, is_right: rules.Mask, values: Sequence[Any], wrong_value: Any
+    ) -> int:
+        """Return the index of the right value that is nearest to the wrong one."""
+        right_indices = np.flatnonzero(is_right).tolist()
+        if self.table[factor].dtype == "category":
+            nearest = right_indices[0]
+        else:
+            nearest = min(
+                right_indices,
+                key=lambda index: abs(float(values[index]) - float(wrong_value)),
+            )
+        return nearest
 
     def _list_thumbnails(self, name: str, numbers: Sequence[int]) -> list[str]:
         """Return the stored images of a part, as paths relative to the run directory."""
@@ -272,16 +290,8 @@ class Renders:
         failing = self.rows[~self.rows["correct"] & self.rows["sweep"].isin(selected)]
         if self.interrupted or not self.config.clusters or failing.empty:
             return None
-        if len(selected) < len(self.sweeps):
-            name = self.sweeps[selected[0]].config.model
-            self.warnings.append(
-                f"Kinds are of the failures of model {name} alone, "
-                "where it was swept by itself."
-            )
-        generator = np.random.default_rng(seeds.stream(self.config.seed, "clusters"))
-        picked = failing.iloc[
-            np.sort(generator.permutation(len(failing))[: self.config.clusters])
-        ]
+        self._warn_about_selection(selected)
+        picked = self._pick_failures(failing)
         self.progress.stage(
             "rendering failures again", len(picked), hint="`clusters` says how many"
         )
@@ -315,6 +325,22 @@ class Renders:
             apart=clusters.apart,
             listed=described_clusters,
         )
+
+    def _warn_about_selection(self, selected: Sequence[int]) -> None:
+        """Add a warning if failures of one of several models are clustered."""
+        if len(selected) < len(self.sweeps):
+            name = self.sweeps[selected[0]].config.model
+            self.warnings.append(
+                f"Kinds are of the failures of model {name} alone, "
+                "where it was swept by itself."
+            )
+
+    def _pick_failures(self, failing: pd.DataFrame) -> pd.DataFrame:
+        """Pick failures at random, in their order."""
+        generator = np.random.default_rng(seeds.stream(self.config.seed, "clusters"))
+        return failing.iloc[
+            np.sort(generator.permutation(len(failing))[: self.config.clusters])
+        ]
 
     def _describe_cluster(
         self, number: int, rows: pd.DataFrame, image: torch.Tensor
@@ -405,13 +431,7 @@ def find_typical_failures(
     none of them is the last to take a turn. The most typical failure of a rule is the
     one nearest to the mean of its failures, by ranks.
     """
-    columns = [table[name] for name in table.attrs["units"]]
-    values = [
-        column.cat.codes if column.dtype == "category" else column for column in columns
-    ]
-    ranks = np.stack(values, axis=1).astype(np.float64).argsort(axis=0).argsort(
-        axis=0
-    ) / len(table)
+    ranks = _rank_rows(table)
     is_left: rules.Mask = ~table["correct"].to_numpy()
     queues = []
     for conditions in (*(rule.conditions for rule in counted_rules), ()):
@@ -433,3 +453,14 @@ def find_typical_failures(
         if failure is not None
     )
     return list(islice(turns, limit))
+
+
+def _rank_rows(table: pd.DataFrame) -> rules.FloatArray:
+    """Return the rank of each row in each parameter, (n, parameters), as a fraction."""
+    columns = [table[name] for name in table.attrs["units"]]
+    values = [
+        column.cat.codes if column.dtype == "category" else column for column in columns
+    ]
+    return np.stack(values, axis=1).astype(np.float64).argsort(axis=0).argsort(
+        axis=0
+    ) / len(table)

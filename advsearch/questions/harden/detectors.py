@@ -131,11 +131,7 @@ def read_coco(directory: Path, model: Model) -> list[Example]:
             for category in coco["categories"]
             if str(category["name"]) in model.labels
         }
-        annotations_of_image = defaultdict[Any, list[Any]](list)
-        for annotation in coco["annotations"]:
-            is_known = annotation["category_id"] in label_of_category
-            if is_known and not annotation.get("iscrowd"):
-                annotations_of_image[annotation["image_id"]].append(annotation)
+        annotations_of_image = _group_annotations(coco, label_of_category)
         if not label_of_category:
             raise InputError(
                 f"data: {path}: none of its categories is a label of model {model.name}"
@@ -146,25 +142,44 @@ def read_coco(directory: Path, model: Model) -> list[Example]:
             pixels = torch.from_numpy(workbench.upright(file, MAX_SIZE))
             if pixels.shape[:2] != (image["height"], image["width"]):
                 raise ValueError(f"{image['file_name']} of another size than it says")
-            annotations = annotations_of_image[image["id"]]
-            boxes = torch.tensor(
-                [annotation["bbox"] for annotation in annotations], dtype=torch.float32
-            ).reshape(-1, 4)
-            # COCO has the width and the height of a box.
-            boxes[:, 2:] += boxes[:, :2]
-            labels = torch.tensor(
-                [
-                    label_of_category[annotation["category_id"]]
-                    for annotation in annotations
-                ],
-                dtype=torch.int64,
-            )
+            boxes, labels = _read_boxes(annotations_of_image, image, label_of_category)
             examples.append(Example(color.to_uint8(pixels), boxes, labels))
         return examples
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise errors.FileFormatError(
             f"{path}: expected COCO's JSON beside images/, got {str(error)[:120]}"
         ) from None
+
+
+def _group_annotations(
+    coco: Any, label_of_category: Mapping[Any, int]
+) -> defaultdict[Any, list[Any]]:
+    """Return the annotations of known categories by the image that they belong to."""
+    annotations_of_image = defaultdict[Any, list[Any]](list)
+    for annotation in coco["annotations"]:
+        is_known = annotation["category_id"] in label_of_category
+        if is_known and not annotation.get("iscrowd"):
+            annotations_of_image[annotation["image_id"]].append(annotation)
+    return annotations_of_image
+
+
+def _read_boxes(
+    annotations_of_image: Mapping[Any, Sequence[Any]],
+    image: Mapping[str, Any],
+    label_of_category: Mapping[Any, int],
+) -> tuple[Tensor, Tensor]:
+    """Return boxes (n, 4) x0, y0, x1, y1 and labels (n,) of an image."""
+    annotations = annotations_of_image[image["id"]]
+    boxes = torch.tensor(
+        [annotation["bbox"] for annotation in annotations], dtype=torch.float32
+    ).reshape(-1, 4)
+    # COCO has the width and the height of a box.
+    boxes[:, 2:] += boxes[:, :2]
+    labels = torch.tensor(
+        [label_of_category[annotation["category_id"]] for annotation in annotations],
+        dtype=torch.int64,
+    )
+    return boxes, labels
 
 
 def _locate_image(directory: Path, name: str, coco_file: Path) -> Path:
@@ -394,16 +409,22 @@ class DetectorTrainer(Trainer):
                 annotation_id = len(annotations) + 1
                 annotations.append(_annotate(annotation_id, image_id, box, label))
         if new:
-            categories = [
-                {"id": index, "name": label}
-                for index, label in enumerate(self.student.model.labels)
-            ]
-            coco = {
-                "images": images,
-                "annotations": annotations,
-                "categories": categories,
-            }
+            coco = self._make_coco(images, annotations)
             run.write_file(f"{directory}/annotations.json", json.dumps(coco).encode())
+
+    def _make_coco(
+        self, images: Sequence[object], annotations: Sequence[object]
+    ) -> dict[str, object]:
+        """Return what `annotations.json` holds."""
+        categories = [
+            {"id": index, "name": label}
+            for index, label in enumerate(self.student.model.labels)
+        ]
+        return {
+            "images": images,
+            "annotations": annotations,
+            "categories": categories,
+        }
 
 
 def _annotate(

@@ -151,11 +151,7 @@ class Trainer(ABC):
         average = [parameter.detach().clone() for parameter in parameters]
         n_steps = 0
         rng = np.random.default_rng([seeds.stream(self.config.seed, "order"), number])
-        indices = [
-            index
-            for index, item in enumerate(pool)
-            for _ in range(self.uses_per_epoch(item))
-        ]
+        indices = self._list_uses(pool)
         with self.gradient_context(new) as compute_gradient:
             for _ in range(self.config.epochs):
                 order = rng.permutation(indices)
@@ -168,13 +164,25 @@ class Trainer(ABC):
                     optimizer.step()
                     schedule.step()
                     n_steps += 1
-                    decay = min(self.average_decay, n_steps / (n_steps + 5))
-                    for mean, parameter in zip(average, parameters, strict=True):
-                        mean.lerp_(parameter.detach(), 1.0 - decay)
+                    self._update_average(n_steps, average, parameters)
                     tick()
-        with torch.no_grad():
-            for mean, parameter in zip(average, parameters, strict=True):
-                parameter.copy_(mean)
+        _copy_average(average, parameters)
+
+    def _list_uses(self, pool: Sequence[Any]) -> list[int]:
+        """Return the indices of the items of an epoch, each as often as it is used."""
+        return [
+            index
+            for index, item in enumerate(pool)
+            for _ in range(self.uses_per_epoch(item))
+        ]
+
+    def _update_average(
+        self, n_steps: int, average: Sequence[Tensor], parameters: Sequence[Tensor]
+    ) -> None:
+        """Move the running average of the parameters towards their values after a step."""
+        decay = min(self.average_decay, n_steps / (n_steps + 5))
+        for mean, parameter in zip(average, parameters, strict=True):
+            mean.lerp_(parameter.detach(), 1.0 - decay)
 
     def _make_optimizer(
         self, parameters: Sequence[nn.Parameter], n_steps: int
@@ -194,6 +202,13 @@ class Trainer(ABC):
             cycle_momentum=False,
         )
         return optimizer, schedule
+
+
+def _copy_average(average: Sequence[Tensor], parameters: Sequence[Tensor]) -> None:
+    """Set the parameters to their running average."""
+    with torch.no_grad():
+        for mean, parameter in zip(average, parameters, strict=True):
+            parameter.copy_(mean)
 
 
 def adjust_warm_up(fraction: float, n_rates: int) -> float:

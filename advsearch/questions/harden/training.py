@@ -389,36 +389,16 @@ class GradientComputer:
         right = [lesson.right_classes for lesson in taught]
         images = _augmented_images(part, hard_lessons, seed)
 
-        rng = np.random.default_rng(seed)
-        mixed = list[int]()
-        if rng.random() < MIXUP_PROBABILITY:
-            mixed = [
-                index
-                for index, lesson in enumerate(taught)
-                if isinstance(lesson, RenderedLesson)
-            ]
-        partners = rng.permutation(mixed).astype(int).tolist()
-        sampled_weight = float(rng.beta(MIXUP_BETA, MIXUP_BETA))
-        partner_weight = min(sampled_weight, 1.0 - sampled_weight)
-        if mixed:
-            images[mixed] = torch.lerp(images[mixed], images[partners], partner_weight)
+        mixed, partners, partner_weight = _mix_images(seed, taught, images)
 
         logits = student.logits(images)
         losses = negative_log_likelihood(logits, right)
-        if mixed:
-            partner_losses = negative_log_likelihood(
-                logits[mixed], [right[index] for index in partners]
-            )
-            losses[mixed] = torch.lerp(losses[mixed], partner_losses, partner_weight)
+        _mix_losses(mixed, logits, right, partners, losses, partner_weight)
         loss = (
             plain_weight * losses[: len(part)].sum()
             + worst_weight * losses[len(part) :].sum()
         )
-        unrendered = [
-            index
-            for index, lesson in enumerate(part)
-            if not isinstance(lesson, RenderedLesson)
-        ]
+        unrendered = _find_unrendered(part)
         if unrendered:
             divergence = self._divergence_from_original(
                 images[unrendered],
@@ -447,6 +427,51 @@ class GradientComputer:
             reduction="sum",
             log_target=True,
         )
+
+
+def _mix_losses(
+    mixed: Sequence[int],
+    logits: Tensor,
+    right: Sequence[tuple[int, ...]],
+    partners: Sequence[int],
+    losses: Tensor,
+    partner_weight: float,
+) -> None:
+    """Mix the losses of mixed images in place, as those of both right classes."""
+    if mixed:
+        partner_losses = negative_log_likelihood(
+            logits[mixed], [right[index] for index in partners]
+        )
+        losses[mixed] = torch.lerp(losses[mixed], partner_losses, partner_weight)
+
+
+def _mix_images(
+    seed: int, taught: Sequence[Lesson], images: Tensor
+) -> tuple[list[int], list[int], float]:
+    """Mix rendered images with each other in place, at random (mixup)."""
+    rng = np.random.default_rng(seed)
+    mixed = list[int]()
+    if rng.random() < MIXUP_PROBABILITY:
+        mixed = [
+            index
+            for index, lesson in enumerate(taught)
+            if isinstance(lesson, RenderedLesson)
+        ]
+    partners = rng.permutation(mixed).astype(int).tolist()
+    sampled_weight = float(rng.beta(MIXUP_BETA, MIXUP_BETA))
+    partner_weight = min(sampled_weight, 1.0 - sampled_weight)
+    if mixed:
+        images[mixed] = torch.lerp(images[mixed], images[partners], partner_weight)
+    return mixed, partners, partner_weight
+
+
+def _find_unrendered(part: Sequence[Lesson]) -> list[int]:
+    """Return the indices of lessons that are not rendered."""
+    return [
+        index
+        for index, lesson in enumerate(part)
+        if not isinstance(lesson, RenderedLesson)
+    ]
 
 
 def _augmented_images(

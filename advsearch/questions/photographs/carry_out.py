@@ -287,26 +287,43 @@ class Photographs:
                     )
                     photo |= {"rendering": rendering, "right": right, "label": label}
                     photo["file"] = f"{rendering}-{number:04d}.jpg"
-                # A sweep over several objects stores which one it was.
-                object_name = None
-                if "object" in values:
-                    object_name = str(values["object"]["value"])
-                model_value: workbench.Value = {
-                    "value": evaluator.model.name,
-                    "unit": "",
-                }
-                row = workbench.add_judgement(
-                    workbench.Row(
-                        kind, number, values={**values, "model": model_value}
-                    ),
-                    evaluator.evaluate(rendering, object_name, cut_photo),
-                )
+                row = _make_row(rendering, values, evaluator, kind, number, cut_photo)
                 payload = {"photo": {**photo}, "answer": row.payload}
                 rows.append(replace(row, payload=payload))
-            if file is not None:
-                path = run / directory.PHOTOGRAPHS / str(photo["file"])
-                writing.write_bytes(path, cut_photo)
+            _write_photo(run, file, photo, cut_photo)
             resumed_run.record(*rows)
+
+
+def _make_row(
+    rendering: str | None,
+    values: Mapping[str, workbench.Value],
+    evaluator: Any,
+    kind: str,
+    number: int,
+    cut_photo: bytes,
+) -> workbench.Row:
+    """Return the row of a model's prediction on a photograph."""
+    # A sweep over several objects stores which one it was.
+    object_name = None
+    if "object" in values:
+        object_name = str(values["object"]["value"])
+    model_value: workbench.Value = {
+        "value": evaluator.model.name,
+        "unit": "",
+    }
+    return workbench.add_judgement(
+        workbench.Row(kind, number, values={**values, "model": model_value}),
+        evaluator.evaluate(rendering, object_name, cut_photo),
+    )
+
+
+def _write_photo(
+    run: Path, file: Path | None, photo: Mapping[str, JsonValue], cut_photo: bytes
+) -> None:
+    """Write a photograph into the folder of a run if it belongs to a rendering."""
+    if file is not None:
+        path = run / directory.PHOTOGRAPHS / str(photo["file"])
+        writing.write_bytes(path, cut_photo)
 
 
 @dataclass(frozen=True)

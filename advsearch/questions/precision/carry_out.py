@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -17,6 +18,7 @@ from advsearch.extend import (
     Problem,
     Progress,
     RunContext,
+    RunDirectory,
     gradients,
     results,
     seeds,
@@ -126,11 +128,16 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
         )
 
     result = measurements.collect(measure_sittings(), make_result)
-    written = [
+    written = _write_figures(run, result)
+    return result.model_copy(update={"figures": [str(path) for path in written]})
+
+
+def _write_figures(run: RunDirectory, result: PrecisionResult) -> list[Path]:
+    """Write the figures of a result, and return their paths."""
+    return [
         run.write_file(f"images/precision.{suffix}", data)
         for suffix, data in draw_figures(result).items()
     ]
-    return result.model_copy(update={"figures": [str(path) for path in written]})
 
 
 class QuantityMeasurer:
@@ -315,15 +322,7 @@ class QuantityMeasurer:
                         bench.reference_error(setting, quantity),
                     )
                 )
-        skipped_counts: dict[str, list[str]] = {}
-        for setting in measured.skipped:
-            skipped_counts.setdefault(f"{title} by {setting.estimator}", []).append(
-                str(setting.spp)
-            )
-        left_out = [
-            f"{line}: {', '.join(counts)} samples"
-            for line, counts in skipped_counts.items()
-        ]
+        left_out = _describe_skipped(title, measured)
         return Sitting(
             points=points,
             references=references,
@@ -346,6 +345,19 @@ class QuantityMeasurer:
             done = passed
 
         return tick
+
+
+def _describe_skipped(title: str, measured: Any) -> list[str]:
+    """Describe which settings were not measured: a line for each estimator."""
+    skipped_counts: dict[str, list[str]] = {}
+    for setting in measured.skipped:
+        skipped_counts.setdefault(f"{title} by {setting.estimator}", []).append(
+            str(setting.spp)
+        )
+    return [
+        f"{line}: {', '.join(counts)} samples"
+        for line, counts in skipped_counts.items()
+    ]
 
 
 def group_by_line(

@@ -131,12 +131,12 @@ def estimate_reference(
         )
     total = np.sum(parts, axis=0)
     value = function(total / count)
-    leave_one_out = [function((total - part) / (count - 1)) for part in parts]
-    center = np.mean(leave_one_out, axis=0)
+    jackknife_values = [function((total - part) / (count - 1)) for part in parts]
+    center = np.mean(jackknife_values, axis=0)
     scatter = math.sqrt(
         (count - 1)
         / count
-        * sum(float(np.sum((each - center) ** 2)) for each in leave_one_out)
+        * sum(float(np.sum((each - center) ** 2)) for each in jackknife_values)
     )
     bias_estimate = (
         (count - 1) * float(np.linalg.norm(center - value)) if count > 2 else 0.0
@@ -436,9 +436,11 @@ def _interpolate_count(
     """Return the samples from which on ordered points stay at or below a goal, and the basis."""
     last = ordered[-1]
     if last.rms > goal:
-        slope = (
-            line.slope if line else None if or_steeper is None else MONTE_CARLO_SLOPE
-        )
+        slope = None
+        if line:
+            slope = line.slope
+        elif or_steeper is not None:
+            slope = MONTE_CARLO_SLOPE
         if (
             slope is None
             or not last.is_known

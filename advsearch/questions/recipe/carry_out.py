@@ -285,15 +285,7 @@ def check_figures(
         kind, options = read_figure_options(described, where)
         location = f"It stands in {where}, figure {index} ({kind})"
         baseline = getattr(options, "beside", None)
-        option_parts = [("of", part) for part in options.of]
-        if baseline:
-            option_parts.append(("beside", baseline))
-        known_parts = [*recipe.parts, PHOTOGRAPHS]
-        for option, part in option_parts:
-            if part not in known_parts:
-                raise errors.UnknownNameError(
-                    "part", part, known_parts, f"{location}, as `{option}`."
-                )
+        _check_option_parts(recipe, options, baseline, location)
         columns_of_part = {
             part: part_columns
             for part, part_columns in columns.items()
@@ -306,6 +298,21 @@ def check_figures(
             names = [value] if isinstance(value, str) else value
             for name in names:
                 _check_column(recipe, name, option, columns_of_part, location)
+
+
+def _check_option_parts(
+    recipe: Recipe, options: Options, baseline: str | None, location: str
+) -> None:
+    """Raise an error if an option of a figure names a part that does not exist."""
+    option_parts = [("of", part) for part in options.of]
+    if baseline:
+        option_parts.append(("beside", baseline))
+    known_parts = [*recipe.parts, PHOTOGRAPHS]
+    for option, part in option_parts:
+        if part not in known_parts:
+            raise errors.UnknownNameError(
+                "part", part, known_parts, f"{location}, as `{option}`."
+            )
 
 
 def _check_column(

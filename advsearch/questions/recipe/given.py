@@ -278,13 +278,7 @@ def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, in
     }
     counts = list[tuple[int, int, int]]()
     for (shape, texture), labels in labels_of_pair.items():
-        same_shape = list[str]()
-        same_texture = list[str]()
-        for (other_shape, other_texture), other_labels in labels_of_pair.items():
-            if other_shape == shape and other_texture != texture:
-                same_shape += other_labels
-            if other_texture == texture and other_shape != shape:
-                same_texture += other_labels
+        same_shape, same_texture = _collect_labels(labels_of_pair, shape, texture)
         n_samples = min(len(same_shape), len(same_texture))
         if n_samples:
             by_shape = _most_frequent_of_sample(same_shape, n_samples, generator)
@@ -293,6 +287,20 @@ def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, in
                 (len(labels), labels.count(by_shape), labels.count(by_texture))
             )
     return counts
+
+
+def _collect_labels(
+    labels_of_pair: Mapping[Any, Sequence[str]], shape: str, texture: str
+) -> tuple[list[str], list[str]]:
+    """Return the predictions about the same shape, and those about the same texture."""
+    same_shape = list[str]()
+    same_texture = list[str]()
+    for (other_shape, other_texture), other_labels in labels_of_pair.items():
+        if other_shape == shape and other_texture != texture:
+            same_shape += other_labels
+        if other_texture == texture and other_shape != shape:
+            same_texture += other_labels
+    return same_shape, same_texture
 
 
 def _most_frequent_of_sample(
@@ -380,10 +388,7 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     names = [rates.strip_control(name) for name in options.shares]
     main_ingredient = mixtures.argmax(axis=1)  # (n,)
     corners = list_triangles(options.side)
-    triangles = pd.Series(
-        [find_triangle(mixture, options.side) for mixture in mixtures]
-    )
-    in_triangle = [(triangles == triangle).to_numpy() for triangle in corners]
+    in_triangle = _split_by_triangle(options, mixtures, corners)
 
     ranking = rates.rank_predictions(rows[rates.PREDICTION_COLUMN])
     margins = _margins_by_ingredient(rows, names, main_ingredient)
@@ -395,25 +400,62 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
         text, heads, table = _describe_ingredients(
             rows, ranking, names, main_ingredient
         )
+    panels = _make_panels(rows, ranking, by_margin, in_triangle)
+    text += _describe_empty(in_triangle, corners)
+
+    def draw(figure: Any) -> None:
+        _draw_panels(figure, panels, list(corners.values()), names, by_margin, options)
+
+    return FigureContent(
+        f"Predictions over {', '.join(names)}",
+        text,
+        heads,
+        table,
+        draw,
+        (max(2.4 * len(panels), 4.8), 3.5),
+    )
+
+
+def _split_by_triangle(
+    options: TernaryOptions,
+    mixtures: npt.NDArray[np.float64],
+    corners: Mapping[Any, Any],
+) -> list[npt.NDArray[np.bool_]]:
+    """Return which mixtures lie in each triangle of the diagram: a mask (n,) for each."""
+    triangles = pd.Series(
+        [find_triangle(mixture, options.side) for mixture in mixtures]
+    )
+    return [(triangles == triangle).to_numpy() for triangle in corners]
+
+
+def _make_panels(
+    rows: Rows,
+    ranking: Sequence[tuple[str, int]],
+    by_margin: bool,
+    in_triangle: Sequence[npt.NDArray[np.bool_]],
+) -> dict[str, list[float | None]]:
+    """Return a mean by triangle for each prediction, or that of the margin."""
     panels = dict[str, list[float | None]]()
     for label, _ in ranking:
         values = (rows[rates.PREDICTION_COLUMN] == label).to_numpy()
         if by_margin:
             values = rows["margin"].astype(float).to_numpy()
         panels[label] = _mean_by_triangle(values, in_triangle)
+    return panels
+
+
+def _describe_empty(
+    in_triangle: Sequence[npt.NDArray[np.bool_]], corners: Mapping[Any, Any]
+) -> list[str]:
+    """Describe how many triangles of the diagram have no picture."""
+    text = list[str]()
     n_empty = sum(not is_inside.any() for is_inside in in_triangle)
     if n_empty:
         text.append(
             f"No picture was drawn in {n_empty} of {len(corners)} parts of the "
             "diagram, which are hatched."
         )
-
-    def draw(figure: Any) -> None:
-        _draw_panels(figure, panels, list(corners.values()), names, by_margin, options)
-
-    size = (max(2.4 * len(panels), 4.8), 3.5)
-    title = f"Predictions over {', '.join(names)}"
-    return FigureContent(title, text, heads, table, draw, size)
+    return text
 
 
 def _read_mixtures(rows: Rows, options: TernaryOptions) -> Float64Array:

@@ -677,9 +677,7 @@ def _group_rows(
             f"figures: rates: expected values of {options.by} that "
             f"differ, got {lower:g} to {upper:g}"
         )
-    position = (values - lower) / (upper - lower) * n_bins
-    in_range = values.between(lower, upper)
-    bin_index = position.clip(upper=n_bins - 1).where(in_range) // 1
+    bin_index = _find_bins(values, lower, upper, n_bins)
     edges = (lower + (upper - lower) * index / n_bins for index in range(n_bins + 1))
     groups = dict[str, Rows]()
     centers = list[float]()
@@ -689,6 +687,13 @@ def _group_rows(
         groups[name] = rows[bin_index == index]
         centers.append((start + end) / 2)
     return groups, centers
+
+
+def _find_bins(values: Any, lower: float, upper: float, n_bins: int) -> Any:
+    """Return the bin of each value, NaN outside of the range."""
+    position = (values - lower) / (upper - lower) * n_bins
+    in_range = values.between(lower, upper)
+    return position.clip(upper=n_bins - 1).where(in_range) // 1
 
 
 def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
@@ -825,13 +830,7 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
             )
         series_name = options.names.get(part, part)
         series.append(series_name)
-        for name, tallies in bars.items():
-            object_pairs = (
-                pairs if name == ALL_OBJECTS else pairs[pairs["object"] == name]
-            )
-            tally, cells = _count_agreement(name, object_pairs)
-            tallies.append(tally)
-            table.append([series_name, name, *cells])
+        _add_agreement(bars, pairs, table, series_name)
         if len(pairs):
             text.append(_describe_agreement(series_name, bars[ALL_OBJECTS][-1], pairs))
         if part == PHOTOGRAPHS:
@@ -853,6 +852,20 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
         lambda figure: _draw_agreement(figure, bars, series),
         (6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),
     )
+
+
+def _add_agreement(
+    bars: dict[str, list[ClusteredFraction]],
+    pairs: Rows,
+    table: list[list[Cell]],
+    series_name: str,
+) -> None:
+    """Add the agreement of pairs to the bars and the table, for all objects and each."""
+    for name, tallies in bars.items():
+        object_pairs = pairs if name == ALL_OBJECTS else pairs[pairs["object"] == name]
+        tally, cells = _count_agreement(name, object_pairs)
+        tallies.append(tally)
+        table.append([series_name, name, *cells])
 
 
 def _draw_agreement(figure: Any, bars: Cells, series: Sequence[str]) -> None:

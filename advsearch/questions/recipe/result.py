@@ -211,18 +211,7 @@ class RecipeResult(views.InNotebook, RunResult):
 def make_view(result: RecipeResult) -> ShownResult:
     """Lay out a result: each figure with its sentences and numbers, then the runs."""
     sections = [ResultPart(text=[result.about], only="page")]
-    sentences = omit_repeated_sentences(result.figures)
-    for number, (figure, text) in enumerate(
-        zip(result.figures, sentences, strict=True), start=1
-    ):
-        image = f"images/figure-{number}.png"
-        sections.append(ResultPart(figure.title, text, figure=image))
-        rows = [list(map(_format_cell, figure.columns, row)) for row in figure.rows]
-        sections.append(
-            ResultPart(
-                "The numbers", heads=figure.columns, rows=rows, folded=True, only="page"
-            )
-        )
+    sections += _list_figures(result)
     sections.append(_list_runs(result.parts))
     objects = ", ".join(map(wording.short_name, result.objects))
     environments = _shorten_names(result.environment)
@@ -243,6 +232,24 @@ def make_view(result: RecipeResult) -> ShownResult:
     return ShownResult(
         result.title, sections, facts, [recipe_name, models, objects], remarks
     )
+
+
+def _list_figures(result: RecipeResult) -> list[ResultPart]:
+    """Return a section for each figure, and one for its numbers."""
+    sections = list[ResultPart]()
+    sentences = omit_repeated_sentences(result.figures)
+    for number, (figure, text) in enumerate(
+        zip(result.figures, sentences, strict=True), start=1
+    ):
+        image = f"images/figure-{number}.png"
+        sections.append(ResultPart(figure.title, text, figure=image))
+        rows = [list(map(_format_cell, figure.columns, row)) for row in figure.rows]
+        sections.append(
+            ResultPart(
+                "The numbers", heads=figure.columns, rows=rows, folded=True, only="page"
+            )
+        )
+    return sections
 
 
 def _list_runs(parts: Sequence[RecipePart]) -> ResultPart:

@@ -365,11 +365,7 @@ def run_replay(
     u = workbench.read_stored_configuration(attack_directory, problem)
     spp = verification_spp(attack)
     conditions = select_conditions(config, problem, spp, load_problem)
-    seed = seeds.stream(parts.config.seed, "replay")
-    table = _Table(u, config.trials, seed, context.run, context.progress)
-    with context.until_interrupted():
-        for batch in batch_by_light(conditions, spp):
-            table.fill(batch)
+    table = _fill_table(context, parts, u, config, conditions, spp)
     return context.result(
         ReplayResult,
         answer=str(attack_directory),
@@ -386,6 +382,23 @@ def run_replay(
         warnings=warnings,
         seed=parts.config.seed,
     )
+
+
+def _fill_table(
+    context: RunContext[ReplayConfig],
+    parts: workbench.AttackParts | None,
+    u: Tensor,
+    config: ReplayConfig,
+    conditions: Any,
+    spp: int,
+) -> _Table:
+    """Render the configuration under each condition, until an interrupt."""
+    seed = seeds.stream(parts.config.seed, "replay")
+    table = _Table(u, config.trials, seed, context.run, context.progress)
+    with context.until_interrupted():
+        for batch in batch_by_light(conditions, spp):
+            table.fill(batch)
+    return table
 
 
 def verification_spp(attack: workbench.AttackSummary) -> int:

@@ -256,6 +256,19 @@ class Cycles:
         if "environment.padded" in values:
             radiance = values["environment.padded"][:, 1:-1].numpy()
 
+        blender_settings = self._make_settings(values, scene, width, height, radiance)
+        shapes = [_turn_for_blender(mesh) for mesh in meshes]
+        return blender_settings, workbench.encode_glb(shapes), radiance
+
+    def _make_settings(
+        self,
+        values: Mapping[str, Tensor],
+        scene: SceneDescription,
+        width: int,
+        height: int,
+        radiance: np.ndarray | None,
+    ) -> dict[str, object]:
+        """Return the settings of the Blender script: image size, camera, lamps and environment."""
         to_world = values.get(
             "camera.to_world",
             torch.from_numpy(geometry.camera_to_world(scene, width / height)),
@@ -282,8 +295,7 @@ class Cycles:
             "bounces": max(0, self._depth - 2),
             "denoise": self._denoise,
         }
-        shapes = [_turn_for_blender(mesh) for mesh in meshes]
-        return blender_settings, workbench.encode_glb(shapes), radiance
+        return blender_settings
 
 
 def _find_unsupported(description: SceneDescription) -> list[str]:

@@ -22,7 +22,7 @@ from advsearch.extend import (
     wording,
 )
 
-WAYS = (
+RENDER_METHODS = (
     "samples",
     "resolution",
     "depth",
@@ -59,7 +59,7 @@ class ReplayConfig(Config):
         None,
         "replay",
         "what is changed, separated by commas",
-        f"some of {', '.join(WAYS)}",
+        f"some of {', '.join(RENDER_METHODS)}",
         otherwise="all",
     )
     model: str | None = setting(
@@ -88,14 +88,14 @@ class ReplayConfig(Config):
     @field_validator("ways")
     @classmethod
     def _check_names(cls, value: str | None) -> str | None:
-        if value is not None and set(settings.split_names(value)) - set(WAYS):
+        if value is not None and set(settings.split_names(value)) - set(RENDER_METHODS):
             raise ValueError("an unknown way")
         return value
 
     @property
     def selected_names(self) -> tuple[str, ...]:
         """The names of the conditions that are rendered."""
-        return WAYS if self.ways is None else settings.split_names(self.ways)
+        return RENDER_METHODS if self.ways is None else settings.split_names(self.ways)
 
     @property
     def models(self) -> tuple[str, ...]:

@@ -653,15 +653,21 @@ def _searched_by_sweep(result: workbench.SweepSummary) -> list[str]:
             axes.setdefault((row.axis, row.unit), []).append(row.value)
     lines = []
     for (axis, unit), values in axes.items():
-        text = ", ".join(map(wording.number_text, values))
-        if all(isinstance(value, tuple) for value in values):  # bins of a range
-            lower = min(low for low, _ in values)
-            upper = max(high for _, high in values)
-            text = f"{lower:.4g} to {upper:.4g}"
+        text = _format_axis_values(values)
         lines.append(f"{axis}: {text} {unit}".rstrip())
     for name, varied in result.drawn.items():
         lines.append(f"{name}: {_format_range(varied)}, drawn by chance")
     return lines
+
+
+def _format_axis_values(values: Sequence[Any]) -> str:
+    """Format the values of an axis; bins as their range."""
+    text = ", ".join(map(wording.number_text, values))
+    if all(isinstance(value, tuple) for value in values):  # bins of a range
+        lower = min(low for low, _ in values)
+        upper = max(high for _, high in values)
+        text = f"{lower:.4g} to {upper:.4g}"
+    return text
 
 
 def _format_range(varied: results.VariedValue) -> str:
@@ -847,23 +853,14 @@ def _make_evidence_run(
     result = read_result(folder)
     claims_of_photographs, photo_rows = _read_photographs(folder)
     claims = [*collect_claims(result), *claims_of_photographs]
-    read_paths = [
-        *find_read_sweeps(result),
-        *find_read_attacks(read_run_settings(folder)),
-    ]
-    recorded = collect_settings(folder, result, read_paths)
-    versions = _collect_versions(folder, result, read_paths)
-    run = describe_run(directory.typed_name(folder), result, claims, recorded, versions)
+    recorded, run = _describe_stored_run(folder, result, claims)
 
     sweeps = _read_sweeps(result)
     searched = _list_searched(folder, result, sweeps) or run.searched
     domain = describe_domain(sweeps[0][0] if sweeps else result, recorded, searched)
     conditions = count_conditions(result)
     weighted = describe_exposure(result, conditions, exposure)
-    criterion_text = list[str]()
-    if criterion is not None:
-        axes = _list_chosen_axes(result, sweeps)
-        criterion_text = describe_criterion(claims, conditions, criterion, axes)
+    criterion_text = _describe_criterion(criterion, result, sweeps, claims, conditions)
     return run.model_copy(
         update={
             "searched": searched,
@@ -879,6 +876,35 @@ def _make_evidence_run(
             ),
         }
     )
+
+
+def _describe_stored_run(
+    folder: Path, result: results.Result, claims: Sequence[views.Claim]
+) -> tuple[list[RecordedSettings], EvidenceRun]:
+    """Return the recorded settings of a run and what it read, and it as evidence."""
+    read_paths = [
+        *find_read_sweeps(result),
+        *find_read_attacks(read_run_settings(folder)),
+    ]
+    recorded = collect_settings(folder, result, read_paths)
+    versions = _collect_versions(folder, result, read_paths)
+    run = describe_run(directory.typed_name(folder), result, claims, recorded, versions)
+    return recorded, run
+
+
+def _describe_criterion(
+    criterion: float | None,
+    result: results.Result,
+    sweeps: Any,
+    claims: Sequence[views.Claim],
+    conditions: Any,
+) -> list[str]:
+    """Describe whether claims meet the criterion; nothing without one."""
+    criterion_text = list[str]()
+    if criterion is not None:
+        axes = _list_chosen_axes(result, sweeps)
+        criterion_text = describe_criterion(claims, conditions, criterion, axes)
+    return criterion_text
 
 
 def _collect_versions(

@@ -221,33 +221,12 @@ def make_evidence_page(
 
 def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
     """Return a run: claims, pictures, tables and sections."""
-    rows = []
-    for claim in run.claims:
-        extent = claim.extent
-        counted = (
-            [
-                f"{extent.count} of {extent.total}",
-                wording.interval_text(extent.interval),
-            ]
-            if extent
-            else ["", ""]
-        )
-        rows.append([claim.kind, claim.statement, *counted])
+    rows = _list_claim_rows(run)
     parts = [
         markup.element("h2", f"{run.run} ({run.command})"),
         markup.make_table(CLAIM_HEADS, rows),
     ]
-    if run.pictures:
-        data = {
-            name: markup.make_data_url(pictures[name], "image/png")
-            for name in run.pictures
-            if name in pictures
-        }
-        images = (
-            markup.element("figure", markup.element("img", src=url, alt=name))
-            for name, url in data.items()
-        )
-        parts.append(markup.element("div", *images, class_="pictures"))
+    parts += _list_images(run, pictures)
     for title, heads, cells in make_tables(run):
         summary = markup.element("summary", f"{title} by condition, {len(cells)} rows")
         parts.append(
@@ -276,3 +255,37 @@ def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
             markup.element("pre", run.command_line, class_="wrap"),
         ]
     return markup.join_html(*parts)
+
+
+def _list_claim_rows(run: EvidenceRun) -> list[list[str]]:
+    """Return the rows of the table of claims."""
+    rows = []
+    for claim in run.claims:
+        extent = claim.extent
+        counted = (
+            [
+                f"{extent.count} of {extent.total}",
+                wording.interval_text(extent.interval),
+            ]
+            if extent
+            else ["", ""]
+        )
+        rows.append([claim.kind, claim.statement, *counted])
+    return rows
+
+
+def _list_images(run: EvidenceRun, pictures: Mapping[str, bytes]) -> list[markup.Html]:
+    """Return the pictures of a run, or nothing."""
+    parts = list[markup.Html]()
+    if run.pictures:
+        data = {
+            name: markup.make_data_url(pictures[name], "image/png")
+            for name in run.pictures
+            if name in pictures
+        }
+        images = (
+            markup.element("figure", markup.element("img", src=url, alt=name))
+            for name, url in data.items()
+        )
+        parts.append(markup.element("div", *images, class_="pictures"))
+    return parts

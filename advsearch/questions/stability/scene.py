@@ -156,7 +156,7 @@ def check_scene(
     mean: Bounds | None = None,
     gradient: Bounds | None = None,
     ending: str = "",
-    beside: Mapping[str, object] | None = None,
+    other_scene: Mapping[str, object] | None = None,
     apart: Bounds = (None, MAX_PICTURE_DIFFERENCE),
     **scene: object,
 ) -> Outcome:
@@ -177,22 +177,18 @@ def check_scene(
         mean: bounds of the image's mean.
         gradient: bounds of the largest absolute entry of the gradient.
         ending: expected status of the search.
-        beside: arguments of `make_renderer` for another scene.
+        other_scene: arguments of `make_renderer` for another scene.
         apart: bounds of the mean difference from its image.
         **scene: further arguments of `make_renderer`.
     """
     renderer = make_renderer(controls, thing, **scene)  # type: ignore[arg-type]
-    start = renderer.start.clone()
-    for index, value in u.items() if isinstance(u, Mapping) else enumerate(u or ()):
-        start[index] = value
+    start = _make_start(u, renderer)
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
     image = render_image(renderer, start, 0, spp)
     _, slope = renderer.gradient(loss, start, 0, spp)
-    relative_error = None
-    gradient_checks = list[Check]()
-    if compare:
-        rows = compare_gradient(renderer, start, spp=spp, seeds=seeds, repeats=repeats)
-        gradient_checks, relative_error = _check_gradient(rows)
+    relative_error, gradient_checks = _check_derivatives(
+        spp, compare, seeds, repeats, renderer, start
+    )
     result = search_scene(renderer, loss, start, spp, evaluations)
     in_range = float(image.min()) >= 0.0 and float(image.max()) <= 1.0
     n_objectives = float(result.non_finite_objectives)
@@ -218,8 +214,50 @@ def check_scene(
         checks.append(
             check_condition(f"the ending is {ending!r}", result.ending.value == ending)
         )
-    if beside is not None:
-        other = make_renderer(**{"controls": controls, **beside})  # type: ignore[arg-type]
+    checks += _compare_with_scene(controls, other_scene, apart, renderer, start)
+    is_finite = bool(torch.isfinite(image).all()) and bool(torch.isfinite(slope).all())
+    is_finite = is_finite and renderer.non_finite == 0
+    return Outcome(checks, is_finite, relative_error, result.ending.value, measured)
+
+
+def _make_start(
+    u: Sequence[float] | Mapping[int, float] | None, renderer: workbench.Renderer
+) -> Tensor:
+    """Return the start (d,) with some or all of its values replaced."""
+    start = renderer.start.clone()
+    for index, value in u.items() if isinstance(u, Mapping) else enumerate(u or ()):
+        start[index] = value
+    return start
+
+
+def _check_derivatives(
+    spp: int,
+    compare: bool,
+    seeds: tuple[int, int],
+    repeats: int,
+    renderer: workbench.Renderer,
+    start: Tensor,
+) -> tuple[Any, list[Check]]:
+    """Compare the gradient with differences, if requested."""
+    relative_error = None
+    gradient_checks = list[Check]()
+    if compare:
+        rows = compare_gradient(renderer, start, spp=spp, seeds=seeds, repeats=repeats)
+        gradient_checks, relative_error = _check_gradient(rows)
+    return relative_error, gradient_checks
+
+
+def _compare_with_scene(
+    controls: ControlSettings,
+    other_scene: Mapping[str, object] | None,
+    apart: Bounds,
+    renderer: workbench.Renderer,
+    start: Tensor,
+) -> list[Check]:
+    """Compare the image with that of another scene, if there is one."""
+    checks = list[Check]()
+    if other_scene is not None:
+        other = make_renderer(**{"controls": controls, **other_scene})  # type: ignore[arg-type]
         difference = mean_difference(
             render_image(renderer, start), render_image(other, other.start)
         )
@@ -228,9 +266,7 @@ def check_scene(
                 "mean difference from the picture beside it", difference, *apart
             )
         )
-    is_finite = bool(torch.isfinite(image).all()) and bool(torch.isfinite(slope).all())
-    is_finite = is_finite and renderer.non_finite == 0
-    return Outcome(checks, is_finite, relative_error, result.ending.value, measured)
+    return checks
 
 
 def _check_gradient(

@@ -298,7 +298,7 @@ def look_through_glass() -> Outcome:
         "environment": {"exposure": [-1.0, 1.0]},
     }
     return check_scene(
-        controls, plugins=make_glass_ball(), beside={}, apart=(0.01, None)
+        controls, plugins=make_glass_ball(), other_scene={}, apart=(0.01, None)
     )
 
 
@@ -368,7 +368,7 @@ register_cases(
             "A black picture changes nothing, and texels have a gradient.",
             {
                 **projector_case({}),
-                "beside": {"controls": {"lens": {}}},
+                "other_scene": {"controls": {"lens": {}}},
                 "apart": (None, 0.02),
             },
         ),
@@ -453,15 +453,17 @@ NO_GROUND = {"ground.size": 0.0}
 
 
 def mesh_case(
-    thing: assets.ObjectAsset, beside: assets.ObjectAsset | None = None
+    thing: assets.ObjectAsset, other_object: assets.ObjectAsset | None = None
 ) -> dict[str, object]:
-    other = {"beside": {"thing": beside, "settings": FRONT_VIEW}} if beside else {}
+    other_scene: dict[str, object] = {}
+    if other_object:
+        other_scene["other_scene"] = {"thing": other_object, "settings": FRONT_VIEW}
     return {
         "controls": TEXTURED_MOVE,
         "thing": thing,
         "settings": FRONT_VIEW,
         "slow": True,
-        **other,
+        **other_scene,
     }
 
 
@@ -469,6 +471,15 @@ def import_box(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
     """Import a box from a file in some unit, at some distance from its origin."""
     corners = [[x, y, z] for x in (-0.3, 0.3) for y in (-0.5, 0.5) for z in (0.0, 1.0)]
     points = np.array(corners) * scale + shift
+    lines = _format_box(points)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "box.obj"
+        path.write_text("\n".join(lines) + "\n")
+        return workbench.load_scene(path).description.object
+
+
+def _format_box(points: np.ndarray) -> list[str]:
+    """Return the lines of an OBJ file with a box of these corners (8, 3)."""
     quads = [
         [0, 4, 6, 2],
         [1, 3, 7, 5],
@@ -481,10 +492,7 @@ def import_box(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
     for a, b, c, d in quads:
         for face in ((a, b, c), (a, c, d)):
             lines.append("f " + " ".join(str(1 + corner) for corner in face))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "box.obj"
-        path.write_text("\n".join(lines) + "\n")
-        return workbench.load_scene(path).description.object
+    return lines
 
 
 def file_case(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
@@ -493,7 +501,7 @@ def file_case(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
         "controls": SHIFT,
         "thing": thing,
         "compare": False,
-        "beside": {"thing": import_box},
+        "other_scene": {"thing": import_box},
     }
 
 
@@ -570,7 +578,7 @@ register_cases(
                 "controls": {"pose": {"y": [9e3, 1e4]}},
                 "u": [1.0],
                 "gradient": (None, 1e-6),
-                "beside": EMPTY_VIEW,
+                "other_scene": EMPTY_VIEW,
             },
         ),
         (
@@ -613,8 +621,8 @@ def million() -> Outcome:
         for counts in ((501, 1000), (64, 128))
     )
     coarse, renderer = (
-        make_renderer(SHIFT, make_checkered_object(made))
-        for made in (coarse_mesh, fine_mesh)
+        make_renderer(SHIFT, make_checkered_object(mesh))
+        for mesh in (coarse_mesh, fine_mesh)
     )
     _, slope = renderer.gradient(
         gradients.make_smooth_loss(renderer.formation.resolution),
@@ -683,13 +691,13 @@ def full_turn(controls: ControlSettings) -> Outcome:
     """Check that 0 and 360 degrees are the same, in picture, gradient and steps."""
     renderer = make_renderer(controls)
     zero = torch.zeros_like(renderer.start)
-    one = torch.ones_like(renderer.start)
+    full = torch.ones_like(renderer.start)
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
-    slopes = [renderer.gradient(loss, u, 0, SPP)[1] for u in (zero, one)]
+    slopes = [renderer.gradient(loss, u, 0, SPP)[1] for u in (zero, full)]
     difference = mean_difference(
-        render_image(renderer, zero), render_image(renderer, one)
+        render_image(renderer, zero), render_image(renderer, full)
     )
-    wrapped_u = float(make_domain(renderer).project(one + 0.01).max())
+    wrapped_u = float(make_domain(renderer).project(full + 0.01).max())
     size = float(slopes[0].abs().max())
     return check_scene(controls, u=[0.0], compare=False).with_checks(
         check_range(

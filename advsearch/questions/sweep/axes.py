@@ -145,22 +145,11 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
             f"{where}: several of them are given as a list: "
             f"{_LISTED_SETTINGS[control_name]}"
         )
-    control: Any = CONTROLS.get(kind)
-    if instance in instances:
-        control = type(instances[instance])
-    if control is None:
-        hint = (
-            f"It stands in {where}; write `grid` CONTROL.PARAMETER=VALUES, such as "
-            "pose.yaw=0:360:24."
-        )
-        raise families.make_unknown_control_error(kind, hint, instances)
+    control = _find_control(instances, kind, instance, where)
     if kind == MITSUBA_CONTROL:
         return _parse_key_axis(name, values, control)
 
-    declared = [*control.declared({parameter_name: values})]
-    if instance in instances:
-        declared += instances[instance].instance_parameters
-    parameters = {parameter.name: parameter for parameter in declared}
+    parameters = _find_parameters(values, instances, control, parameter_name, instance)
     if not parameter_name:
         raise InputError(
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
@@ -176,8 +165,42 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         )
     parameter = parameters[parameter_name]
     _check_scalar(where, control, parameter, instance)
-    parsed_values = parse_axis_values(where, parameter, values)
-    return Axis(control.kind, instance, parameter, parsed_values)
+    return Axis(
+        control.kind,
+        instance,
+        parameter,
+        parse_axis_values(where, parameter, values),
+    )
+
+
+def _find_control(
+    instances: Mapping[str, Control], kind: str, instance: str, where: str
+) -> Any:
+    """Return the class of a control of a kind or an instance."""
+    control: Any = CONTROLS.get(kind)
+    if instance in instances:
+        control = type(instances[instance])
+    if control is None:
+        hint = (
+            f"It stands in {where}; write `grid` CONTROL.PARAMETER=VALUES, such as "
+            "pose.yaw=0:360:24."
+        )
+        raise families.make_unknown_control_error(kind, hint, instances)
+    return control
+
+
+def _find_parameters(
+    values: Any,
+    instances: Mapping[str, Control],
+    control: Any,
+    parameter_name: str,
+    instance: str,
+) -> dict[str, Any]:
+    """Return the parameters of a control by name."""
+    declared = [*control.declared({parameter_name: values})]
+    if instance in instances:
+        declared += instances[instance].instance_parameters
+    return {parameter.name: parameter for parameter in declared}
 
 
 def _parse_key_axis(name: str, values: Any, control: Any) -> Axis:

@@ -165,9 +165,7 @@ def sweep(
     if callable(task):
         task = make_task(task)
     loaded = _name_loaded(scenes)
-    set_options: dict[str, Any] = {
-        name: value for name, value in settings.items() if value is not None
-    }
+    set_options = _drop_unset(settings)
     described: dict[str, object] = {
         "model": ",".join(get_model_name(network) for network in networks),
         "task": to_setting(task) if isinstance(task, Task) else task,
@@ -187,10 +185,7 @@ def sweep(
     )
     _check_config(config)
     progress = watcher(progress)
-    are_named = all(isinstance(network, (str, Path)) for network in networks)
-    has_objects = bool(loaded) or bool(loading.list_session_only_controls(controls))
-    if has_objects or not are_named or isinstance(task, FunctionTask):
-        naming.check_no_worker_settings(set_options)
+    _check_can_use_workers(task, controls, networks, loaded, set_options)
     return _run_config(
         config,
         scenes=loaded,
@@ -201,6 +196,28 @@ def sweep(
         tracker=tracker,
         progress=progress,
     )
+
+
+def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:
+    """Return the settings that are not None."""
+    set_options: dict[str, Any] = {
+        name: value for name, value in settings.items() if value is not None
+    }
+    return set_options
+
+
+def _check_can_use_workers(
+    task: AnyTask,
+    controls: Controls,
+    networks: Sequence[Any],
+    loaded: Sequence[Any],
+    set_options: Mapping[str, Any],
+) -> None:
+    """Raise an error if workers are requested for objects that they cannot load."""
+    are_named = all(isinstance(network, (str, Path)) for network in networks)
+    has_objects = bool(loaded) or bool(loading.list_session_only_controls(controls))
+    if has_objects or not are_named or isinstance(task, FunctionTask):
+        naming.check_no_worker_settings(set_options)
 
 
 def _find_attack_run(

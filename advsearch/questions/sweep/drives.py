@@ -384,13 +384,7 @@ class Drives:
         drives = [
             track_drive(drive_frames, tracker, task.iou) for drive_frames in frames
         ]
-        loose_iou = min(MIN_OVERLAP, task.iou)
-        lost_loosely = np.array(
-            [
-                track_drive(drive_frames, tracker, loose_iou).lost
-                for drive_frames in frames
-            ]
-        )
+        lost_loosely = _count_lost_loosely(task, tracker, frames)
         lost = np.array([drive.lost for drive in drives], dtype=float)
         switches = np.array([drive.switches for drive in drives], dtype=float)
         longest_gap = np.array([drive.gap for drive in drives], dtype=float)
@@ -430,6 +424,14 @@ class Drives:
             marks = scene.problems[0].find_marks(image, query.u)
             frames.append(np.asarray(marked(image.numpy(), marks), dtype=np.float32))
         save_drive(run, "drive", frames, self.seconds)
+
+
+def _count_lost_loosely(task: Detection, tracker: Any, frames: Any) -> npt.NDArray[Any]:
+    """Count the tracks that each drive loses if boxes may overlap less."""
+    loose_iou = min(MIN_OVERLAP, task.iou)
+    return np.array(
+        [track_drive(drive_frames, tracker, loose_iou).lost for drive_frames in frames]
+    )
 
 
 def find_longest_run(flags: npt.NDArray[np.bool_]) -> int:

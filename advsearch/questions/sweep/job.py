@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -514,6 +514,27 @@ class SweptScene:
             if not judgement.right
         }
         seconds = (time.perf_counter() - begin) / len(queries)
+        evaluations = self._make_evaluations(
+            queries, n_models, images, judgements, seconds, wrong_images
+        )
+        # What concerns the batch stands in its last evaluation.
+        evaluations[-1] = replace(
+            evaluations[-1],
+            light=[predictor.summarize() for predictor in self.predictors.values()],
+            non_finite=max(0, self.n_non_finite - not_finite_before),
+        )
+        return evaluations
+
+    def _make_evaluations(
+        self,
+        queries: Sequence[Query],
+        n_models: int,
+        images: Any,
+        judgements: Any,
+        seconds: float,
+        wrong_images: Collection[int],
+    ) -> list[Evaluation]:
+        """Return the evaluation of each query, with the images of its configuration."""
         evaluations = list[Evaluation]()
         for query in queries:
             number, model = divmod(query.number, n_models)
@@ -528,12 +549,6 @@ class SweptScene:
                 is_wrong = number in wrong_images
                 evaluation = self._attach_images(evaluation, query, image, is_wrong)
             evaluations.append(evaluation)
-        # What concerns the batch stands in its last evaluation.
-        evaluations[-1] = replace(
-            evaluations[-1],
-            light=[predictor.summarize() for predictor in self.predictors.values()],
-            non_finite=max(0, self.n_non_finite - not_finite_before),
-        )
         return evaluations
 
     def _judge(

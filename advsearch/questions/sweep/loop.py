@@ -12,6 +12,7 @@ import json
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -56,6 +57,7 @@ from advsearch.questions.sweep.result import (
 from advsearch.questions.sweep.settings import BLIND
 from advsearch.questions.sweep.summary import (
     ArmComparison,
+    AxisRow,
     ChangeRates,
     DriveRates,
     SurfaceMap,
@@ -500,6 +502,10 @@ class Sweep:
         path = None if self.run is None else self.run.path
         return SweepResult(summary, path, tuple(self.journal.rows))
 
+    def _sampled_values(self) -> dict[str, Any]:
+        """Return what varies in each number that is sampled, by its name."""
+        return {number.name: number.varied_value for number in self._sampled_numbers}
+
     def _summarize(
         self, predictions: Predictions, ending: str, worst: WorstConfiguration | None
     ) -> SweepSummary:
@@ -519,16 +525,14 @@ class Sweep:
         return SweepSummary(
             run=None if path is None else str(path),
             object=config.object,
-            model=",".join(model.name for model in job.models),
+            model=",".join(_get_names(job.models)),
             task=config.task_name,
             environment=self.points.environment or config.environment_name,
-            controls=[control.name for control in job.controls],
+            controls=_get_names(job.controls),
             ending=ending,
             image_formation=formation,
             gains=gains if len(gains) > 1 else None,
-            drawn={
-                number.name: number.varied_value for number in self._sampled_numbers
-            },
+            drawn=self._sampled_values(),
             planned=self.n_rows,
             **vars(count_by_unit(right, units, outcome)),
             out_of_view=int(predictions.is_hidden.sum()),
@@ -536,9 +540,7 @@ class Sweep:
             units=len(np.unique(units)) if self.units.size > 1 and len(units) else None,
             not_finite=predictions.n_non_finite,
             answers=predictions.frequent_wrong_labels,
-            axes=[
-                row for axis in axes for row in axis.make_rows(right, units, outcome)
-            ],
+            axes=_make_axis_rows(axes, right, units, outcome),
             cells=make_map(axes, right, predictions.margin[rows]),
             beside=self._compare_arms(predictions),
             worst=worst,
@@ -718,6 +720,21 @@ class Sweep:
                 "numbers; "
                 "they count as not right."
             )
+
+
+def _get_names(items: Iterable[Any]) -> list[str]:
+    """Return the names of models or controls."""
+    return [item.name for item in items]
+
+
+def _make_axis_rows(
+    axes: Iterable[TableAxis],
+    right: npt.NDArray[np.bool_],
+    units: npt.NDArray[np.int64],
+    outcome: npt.NDArray[np.uint8],
+) -> list[AxisRow]:
+    """Return the rows of the tables of all axes."""
+    return [row for axis in axes for row in axis.make_rows(right, units, outcome)]
 
 
 def _to_claim(judgement: Judgement) -> WorstClaim:

@@ -137,22 +137,7 @@ def make_sweep_page(
         for source, run in zip(sources, runs, strict=True)
         if source.rows is not None
     ]
-    descriptions = list[JsonObject]()
-    embedded_rows = list[Html]()
-    image_notes = list[Html]()
-    for index, (source, path, summary) in enumerate(explored):
-        description: JsonObject = {"name": source.name, "parts": source.is_partial}
-        if source.is_embedded:
-            row_id = f"rows-{index}"
-            description["embedded"] = row_id
-            embedded_rows.append(_embed_rows(source.rows, row_id))
-        else:
-            description["rows"] = source.rows
-        if source.thumbnails is not None:
-            images, note = _describe_images(source, source.thumbnails)
-            description["pictures"] = images
-            image_notes += [] if note is None else [note]
-        descriptions.append(description | _describe_evaluation(path, summary))
+    descriptions, embedded_rows, image_notes = _describe_runs(explored)
 
     stills = list[Html]()
     parts = list[Html | None]()
@@ -174,6 +159,29 @@ def make_sweep_page(
         scripts=["sweep.js"],
         connects=needs_connection,
     )
+
+
+def _describe_runs(
+    explored: Sequence[tuple[SweepSource, Path, SweepSummary | None]],
+) -> tuple[list[JsonObject], list[Html], list[Html]]:
+    """Return the descriptions of runs, the rows that the page embeds, and notes on images."""
+    descriptions = list[JsonObject]()
+    embedded_rows = list[Html]()
+    image_notes = list[Html]()
+    for index, (source, path, summary) in enumerate(explored):
+        description: JsonObject = {"name": source.name, "parts": source.is_partial}
+        if source.is_embedded:
+            row_id = f"rows-{index}"
+            description["embedded"] = row_id
+            embedded_rows.append(_embed_rows(source.rows, row_id))
+        else:
+            description["rows"] = source.rows
+        if source.thumbnails is not None:
+            images, note = _describe_images(source, source.thumbnails)
+            description["pictures"] = images
+            image_notes += [] if note is None else [note]
+        descriptions.append(description | _describe_evaluation(path, summary))
+    return descriptions, embedded_rows, image_notes
 
 
 def _embed_rows(rows: Any, element_id: str) -> Html:

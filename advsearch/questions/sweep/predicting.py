@@ -73,7 +73,7 @@ class Groups:
         grid: of the sweep.
         samples: at each point of the grid.
         within: whether images of a group may differ along each axis of the grid.
-        drawn: whether they may differ in what is sampled.
+        is_sampled: whether they may differ in what is sampled.
         frames: the axis with the frames of a drive, which have one draw.
 
     Attributes:
@@ -87,7 +87,7 @@ class Groups:
         grid: ProductIndex,
         samples: int,
         within: tuple[bool, ...],
-        drawn: bool,
+        is_sampled: bool,
         frames: int | None = None,
     ) -> None:
         self.grid = grid
@@ -95,10 +95,10 @@ class Groups:
         # Samples are like one more axis, the fastest.
         self._all_axes = ProductIndex((*grid.sizes, samples))
         axis_is_within = [
-            may_differ and (drawn or axis == frames)
+            may_differ and (is_sampled or axis == frames)
             for axis, may_differ in enumerate(within)
         ]
-        self._is_within = (*axis_is_within, drawn)
+        self._is_within = (*axis_is_within, is_sampled)
         within_sizes = self._select(self._all_axes.sizes, True)
         between_sizes = self._select(self._all_axes.sizes, False)
         self._within = ProductIndex(tuple(within_sizes))

@@ -27,14 +27,14 @@ from advsearch.engine.loading import fit_camera, load_scene
 from advsearch.engine.record import read_judgement
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress
-from advsearch.questions.sweep.job import SceneLoader
+from advsearch.questions.sweep.job import SceneLoader, Job
 from advsearch.questions.sweep.result import count_independent
 from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
 from advsearch.report.figures import drawn
 from advsearch.report.wording import short_name
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
-from advsearch.scene.assets import ObjectAsset
+from advsearch.scene.assets import BoolArray, IntArray, ObjectAsset
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import Surfaces
 from advsearch.scene.geometry import camera_to_world
@@ -121,23 +121,18 @@ def compare_parts(
         the bound that is nearer to 0, without its sign, 0 if the interval contains 0.
         Without an interval `strength` is the absolute difference.
     """
-    seen = counts.visible_counts[part_slice]
+    n_visible = counts.visible_counts[part_slice]
     wrong = counts.wrong_counts[part_slice]
     n_images = counts.n_images
     n_failures = counts.n_failures
-    is_compared = (seen >= min_images) & (n_images - seen >= min_images)
+    is_compared = (n_visible >= min_images) & (n_images - n_visible >= min_images)
     nan_columns = dict.fromkeys(("difference", "low", "high", "p"), np.nan)
     part_indices = np.arange(len(counts.visible_counts))[part_slice]
     parts = pd.DataFrame(nan_columns, index=part_indices).assign(compared=is_compared)
     if is_compared.any():
-        n = seen[is_compared]
-        k = wrong[is_compared]
-        difference, low, high = _newcombe(k, n, n_failures - k, n_images - n)
-        if counts.permuted_failures is not None:
-            low = np.full(len(n), np.nan)
-            high = low
-        p_value = _permutation_p_value(counts, k, n, part_indices[is_compared])
-        columns = np.stack([difference, low, high, p_value], axis=1)
+        columns = _compute_comparison(
+            counts, n_visible, is_compared, wrong, n_failures, n_images, part_indices
+        )
         parts.loc[is_compared, list(nan_columns)] = columns
     nearer_bound = np.where(
         parts.low.isna(), parts.difference.abs(), np.maximum(parts.low, -parts.high)
@@ -146,6 +141,26 @@ def compare_parts(
         significant=parts.p <= SIGNIFICANCE_LEVEL,
         strength=np.nan_to_num(np.maximum(nearer_bound, 0.0)),
     )
+
+
+def _compute_comparison(
+    counts: PartCounts,
+    n_visible: IntArray,
+    is_compared: BoolArray,
+    wrong: IntArray,
+    n_failures: IntArray,
+    n_images: int,
+    part_indices: IntArray,
+) -> Float64Array:
+    """Return difference, lower and upper bound and p-value of each compared part, (n, 4)."""
+    n = n_visible[is_compared]
+    k = wrong[is_compared]
+    difference, low, high = _newcombe(k, n, n_failures - k, n_images - n)
+    if counts.permuted_failures is not None:
+        low = np.full(len(n), np.nan)
+        high = low
+    p_value = _permutation_p_value(counts, k, n, part_indices[is_compared])
+    return np.stack([difference, low, high, p_value], axis=1)
 
 
 def _permutation_p_value(
@@ -402,9 +417,7 @@ def _make_counts(
         wrong: from `_read_wrong`.
     """
     job = scenes.job
-    units = scenes.load(0).points[job.image_sizes[0]].units
-    image_numbers = np.arange(wrong[..., 0].size)
-    draws = np.asarray(units.draw(image_numbers)).reshape(wrong.shape[:2])
+    draws = _draw_of_images(scenes, wrong, job)
     n_models = len(job.models)
     counts = dict[str, SurfaceCounts]()
     for object_index, (name, asset) in enumerate(assets.items()):
@@ -422,6 +435,15 @@ def _make_counts(
         ]
         counts[name] = SurfaceCounts(parts, part_counts)
     return counts
+
+
+def _draw_of_images(
+    scenes: SceneLoader, wrong: npt.NDArray[np.int8], job: Job
+) -> npt.NDArray[Any]:
+    """Return the draw of each image, (scenes, images of a scene)."""
+    units = scenes.load(0).points[job.image_sizes[0]].units
+    image_numbers = np.arange(wrong[..., 0].size)
+    return np.asarray(units.draw(image_numbers)).reshape(wrong.shape[:2])
 
 
 def _make_part_counts(
@@ -540,18 +562,32 @@ def _write_map(
         for array_name, array in _stored_arrays(object_counts, comparisons).items():
             arrays[f"{array_name}_{number}"] = array
         panels += _make_panels(assets[name], object_counts, comparisons, name, models)
-        for model, tally, frames in zip(
-            models, object_counts.part_counts, comparisons, strict=True
-        ):
-            tables += [
-                object_counts.summarize_kind(name, model, tally, kind, frame)
-                for kind, frame in frames.items()
-            ]
+        tables += _make_tables(models, object_counts, comparisons, name)
+    _write_arrays(run, arrays)
+    _save_figure(panels[:MAX_PANELS], run)
+    return SurfaceMap(file=COUNTS_FILE, cells=MAP_SIZE, least=MIN_IMAGES, tables=tables)
+
+
+def _make_tables(
+    models: Sequence[str], object_counts: SurfaceCounts, comparisons: Any, name: str
+) -> list[SurfaceTable]:
+    """Return the tables of an object: one for each model and kind of part."""
+    tables = list[SurfaceTable]()
+    for model, tally, frames in zip(
+        models, object_counts.part_counts, comparisons, strict=True
+    ):
+        tables += [
+            object_counts.summarize_kind(name, model, tally, kind, frame)
+            for kind, frame in frames.items()
+        ]
+    return tables
+
+
+def _write_arrays(run: RunDirectory, arrays: dict[str, Any]) -> None:
+    """Write the counts as a compressed numpy archive."""
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)
     write_bytes(run.path / COUNTS_FILE, stream.getvalue())
-    _save_figure(panels[:MAX_PANELS], run)
-    return SurfaceMap(file=COUNTS_FILE, cells=MAP_SIZE, least=MIN_IMAGES, tables=tables)
 
 
 def _compare_kinds(counts: PartCounts, parts: SurfaceParts) -> dict[str, pd.DataFrame]:

@@ -127,14 +127,7 @@ class ConstantVelocity:
         Returns:
             The tracks with a box, those without, and the boxes without a track.
         """
-        overlap_rows = [compute_overlaps(boxes, track.box) for track in tracks]
-        overlap_table = np.array(overlap_rows).reshape(len(tracks), len(boxes))
-        pairs = zip(*linear_sum_assignment(-overlap_table), strict=True)
-        box_of_track = {
-            track: box
-            for track, box in pairs
-            if overlap_table[track, box] >= self.overlap
-        }
+        box_of_track = self._match(tracks, boxes)
         assigned = list[_Track]()
         for track_index, box_index in box_of_track.items():
             track = tracks[track_index]
@@ -148,6 +141,17 @@ class ConstantVelocity:
         ]
         free_boxes = [box for index, box in enumerate(boxes) if index not in used_boxes]
         return assigned, free_tracks, free_boxes
+
+    def _match(self, tracks: Sequence[_Track], boxes: Float64Array) -> dict[int, int]:
+        """Return the index of the box of each matched track, by the largest overlap."""
+        overlap_rows = [compute_overlaps(boxes, track.box) for track in tracks]
+        overlap_table = np.array(overlap_rows).reshape(len(tracks), len(boxes))
+        pairs = zip(*linear_sum_assignment(-overlap_table), strict=True)
+        return {
+            track: box
+            for track, box in pairs
+            if overlap_table[track, box] >= self.overlap
+        }
 
 
 def compute_overlaps(boxes: Float64Array, box: Float64Array) -> Float64Array:

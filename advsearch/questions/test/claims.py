@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import islice, repeat
 from typing import Any
@@ -71,6 +71,25 @@ CLAIM_WORKER = "advsearch.questions.test.claims:claim_worker"
 
 
 @dataclass
+class _PictureSample:
+    """What the pictures show that a claim was tested with.
+
+    Attributes:
+        values: score of each picture that counts.
+        wrong_payloads: what the task recorded of wrong predictions.
+        n_hidden: pictures without the object in view, which do not count.
+        verdict: what they decide.
+        worst: of the worst wrong picture: how bad it is, its query, and its text.
+    """
+
+    values: list[float] = field(default_factory=list)
+    wrong_payloads: list[Any] = field(default_factory=list)
+    n_hidden: int = 0
+    verdict: str = UNDECIDED
+    worst: tuple[float, workbench.Query, str] | None = None
+
+
+@dataclass
 class ClaimTester:
     """Tests the claims of a suite.
 
@@ -132,16 +151,7 @@ class ClaimTester:
         self, pending: ClaimResult, config: AttackConfig
     ) -> ClaimResult:
         """Test by a search, which runs as a part of this run, that nothing breaks a model."""
-        remaining = max(0.001, self.time_limit - self.elapsed_seconds)
-        seconds = min(remaining, config.seconds or math.inf)
-        changes = {
-            "workers": self.config.workers,
-            "cluster": self.config.cluster,
-            "seconds": seconds if math.isfinite(seconds) else None,
-        }
-        search = config.model_copy(update=changes).with_python_only_parts(
-            config.python_only_parts
-        )
+        search = self._make_search(config)
         summary = self.context.run_part(pending.name, search)
         assert isinstance(summary, workbench.AttackSummary)
         self.warnings += summary.warnings
@@ -167,6 +177,19 @@ class ClaimTester:
             }
         )
 
+    def _make_search(self, config: AttackConfig) -> AttackConfig:
+        """Return the settings of the search, within the remaining time."""
+        remaining = max(0.001, self.time_limit - self.elapsed_seconds)
+        seconds = min(remaining, config.seconds or math.inf)
+        changes = {
+            "workers": self.config.workers,
+            "cluster": self.config.cluster,
+            "seconds": seconds if math.isfinite(seconds) else None,
+        }
+        return config.model_copy(update=changes).with_python_only_parts(
+            config.python_only_parts
+        )
+
     def _test_by_pictures(
         self,
         pending: ClaimResult,
@@ -182,53 +205,82 @@ class ClaimTester:
         sequence = statistics.sequential.ConfidenceSequence(
             self.suite.confidence, sides=1
         )
-        values = list[float]()
-        wrong_payloads = list[Any]()
-        n_hidden = 0
-        verdict = UNDECIDED
-        worst: tuple[float, workbench.Query, str] | None = None
         with self._open_evaluations(pending.name, claim, config, problem) as evaluated:
-            for query, evaluation, other in evaluated:
-                value, badness, text = score_picture(claim, evaluation, other)
-                if value is None:
-                    n_hidden += 1
-                    continue
-                if not evaluation.required_judgement.right:
-                    wrong_payloads.append(evaluation.required_judgement.payload)
-                sequence.add(value)
-                values.append(value)
-                if value == 0.0 and (worst is None or badness > worst[0]):
-                    worst = badness, query, text
-                verdict = _decide(sequence, threshold_mean(claim))
-                if verdict != UNDECIDED:
-                    break
+            sample = self._sample_pictures(evaluated, claim, sequence)
 
+        example, picture = self._save_example(pending, sample.worst, problem)
+        is_late = sample.verdict == UNDECIDED and self.out_of_time
+        reason = _picture_reason(
+            claim,
+            sample.verdict,
+            sample.values,
+            sequence.interval,
+            example,
+            sample.wrong_payloads,
+            problem,
+        )
+        if sample.n_hidden:
+            reason += (
+                f"; the object is not to be seen in {sample.n_hidden} more, "
+                "which are not counted"
+            )
+        if is_late:
+            reason += f"; {OUT_OF_TIME_REASON}"
+        return pending.model_copy(
+            update={
+                "answer": sample.verdict,
+                "reason": reason,
+                "cause": Cause.OUT_OF_TIME if is_late else None,
+                "interval": _to_claim_scale(claim, *sequence.interval),
+                "pictures": len(sample.values),
+                "spp": samples_per_pixel(config),
+                "rate": _to_claim_scale(claim, sequence.mean)[0]
+                if sample.values
+                else None,
+                "picture": picture,
+            }
+        )
+
+    @staticmethod
+    def _sample_pictures(
+        evaluated: Iterable[Any],
+        claim: ShareClaim | NoWorseClaim,
+        sequence: Any,
+    ) -> _PictureSample:
+        """Add pictures to a confidence sequence until it decides the claim."""
+        sample = _PictureSample()
+        for query, evaluation, other in evaluated:
+            value, badness, text = score_picture(claim, evaluation, other)
+            if value is None:
+                sample.n_hidden += 1
+                continue
+            judgement = evaluation.required_judgement
+            if not judgement.right:
+                sample.wrong_payloads.append(judgement.payload)
+            sequence.add(value)
+            sample.values.append(value)
+            worst = sample.worst
+            if value == 0.0 and (worst is None or badness > worst[0]):
+                sample.worst = (badness, query, text)
+            sample.verdict = _decide(sequence, threshold_mean(claim))
+            if sample.verdict != UNDECIDED:
+                break
+        return sample
+
+    def _save_example(
+        self,
+        pending: ClaimResult,
+        worst: tuple[float, workbench.Query, str] | None,
+        problem: Problem,
+    ) -> tuple[str, str | None]:
+        """Describe the worst picture and store it; empty without one."""
         example = ""
         picture = None
         if worst is not None:
             _, query, text = worst
             example = f"{text}: {self._describe(problem, query)}"
             picture = self._save_picture(pending.name, problem, query)
-        is_late = verdict == UNDECIDED and self.out_of_time
-        reason = _picture_reason(
-            claim, verdict, values, sequence.interval, example, wrong_payloads, problem
-        )
-        if n_hidden:
-            reason += f"; the object is not to be seen in {n_hidden} more, which are not counted"
-        if is_late:
-            reason += f"; {OUT_OF_TIME_REASON}"
-        return pending.model_copy(
-            update={
-                "answer": verdict,
-                "reason": reason,
-                "cause": Cause.OUT_OF_TIME if is_late else None,
-                "interval": _to_claim_scale(claim, *sequence.interval),
-                "pictures": len(values),
-                "spp": samples_per_pixel(config),
-                "rate": _to_claim_scale(claim, sequence.mean)[0] if values else None,
-                "picture": picture,
-            }
-        )
+        return example, picture
 
     @contextmanager
     def _open_evaluations(

@@ -411,6 +411,23 @@ def add_counterexample(suite: str, run: str) -> Counterexample:
     configuration = workbench.read_stored_configuration(path, problem)
     offsets = (configuration - problem.domain.start).numpy()
     config = parts.config.make_repeatable()
+    values = _make_values(config, path, summary, parts)
+    base = counterexample_directory(suite) / _name_counterexample(path)
+    base.parent.mkdir(parents=True, exist_ok=True)
+    thumbnail = _make_thumbnail(path / "images" / "adversarial.png")
+    writing.write_bytes(base.with_name(f"{base.name}{PICTURE_SUFFIX}"), thumbnail)
+    return _write_smallest(
+        base, values, offsets, problem, over=varies_conditions(config)
+    )
+
+
+def _make_values(
+    config: AttackConfig,
+    path: Path,
+    summary: workbench.AttackSummary,
+    parts: workbench.AttackParts,
+) -> dict[str, Any]:
+    """Return what the file of a counterexample holds."""
     stored_settings = {
         name: value
         for name, value in config.to_json().items()
@@ -426,13 +443,7 @@ def add_counterexample(suite: str, run: str) -> Counterexample:
         "scene": compute_scene_digest(parts.scene.description),
         "spp": summary.verified.spp,
     }
-    base = counterexample_directory(suite) / _name_counterexample(path)
-    base.parent.mkdir(parents=True, exist_ok=True)
-    thumbnail = _make_thumbnail(path / "images" / "adversarial.png")
-    writing.write_bytes(base.with_name(f"{base.name}{PICTURE_SUFFIX}"), thumbnail)
-    return _write_smallest(
-        base, values, offsets, problem, over=varies_conditions(config)
-    )
+    return values
 
 
 def _write_smallest(
