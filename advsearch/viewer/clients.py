@@ -1,7 +1,8 @@
 """Connections of the dashboard's server: worker threads, time limits, and HTTPS.
 
 A few workers serve the requests. A client that has sent nothing yet occupies none of
-them; a slow client occupies one until its time is up, or for `SLOW_CLIENT_SECONDS` while others wait.
+them; a slow client occupies one until its time is up, or for `SLOW_CLIENT_SECONDS`
+while others wait.
 """
 
 from __future__ import annotations

@@ -41,7 +41,10 @@ TYPICAL_BYTES = 5000
 
 
 def make_thumbnail(picture: object) -> bytes:
-    """Encode a display-referred image (H, W, 3) in [0, 1] as a JPEG of at most `THUMBNAIL_SIZE` pixels."""
+    """Encode a display-referred image (H, W, 3) in [0, 1] as a small JPEG.
+
+    It has at most `THUMBNAIL_SIZE` pixels along either side.
+    """
     values: Bytes = to_8bit(picture)
     return _encode_jpeg(Image.fromarray(values))
 

@@ -649,8 +649,8 @@ def _remarks(findings: RunState, problem: Problem, journal: Journal) -> list[str
             )
         else:
             text += (
-                f" would leave the rate within {100 * MAX_MOVED_FRACTION:.0f} points. A check takes "
-                "no more than "
+                f" would leave the rate within {100 * MAX_MOVED_FRACTION:.0f} points. "
+                "A check takes no more than "
                 f"{OVER_LADDER[-1]}, and {MAX_SAMPLE_RATIO} times the samples of the "
                 "searches; `verify_spp` asks for more."
             )

@@ -163,8 +163,8 @@ def make_lessons(
         seed: root of the samples.
         n_plain: further views without worst images.
         n_tries: random configurations of each view that are rendered where a matrix of
-            light transport does not give the images (see `sample_configurations`). None renders each
-            view twice: with a single control changed, and with all of them.
+            light transport does not give the images (see `sample_configurations`). None renders
+            each view twice: with a single control changed, and with all of them.
         shares_texture: whether the views have one adversarial texture.
     """
     has_matrix = bool(n_views) and problem.is_linear

@@ -88,8 +88,8 @@ class MeasuredRounds:
     ) -> float:
         """Estimate the seconds for `MIN_CALLS` calls of a new setting and of earlier ones.
 
-        An earlier setting that needs more than a fraction `MAX_SETTING_FRACTION` of the remaining time
-        turned out too expensive, and waits until the end.
+        An earlier setting that needs more than a fraction `MAX_SETTING_FRACTION` of the remaining
+        time turned out too expensive, and waits until the end.
         """
         cold_seconds = list[float]()
         earlier_seconds = 0.0

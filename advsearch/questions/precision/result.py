@@ -344,7 +344,8 @@ def make_headline(result: PrecisionResult) -> str:
 def describe_recommendation(recommendation: Recommended, goal: float) -> str:
     """Describe a recommended setting, or that none reaches the goal."""
     quantity = describe_quantity(recommendation.quantity, recommendation.control)
-    goal_text = f"{100 * goal:.3g} % error of {quantity}{FAMILY_SUFFIXES.get(recommendation.family, '')}"
+    suffix = FAMILY_SUFFIXES.get(recommendation.family, "")
+    goal_text = f"{100 * goal:.3g} % error of {quantity}{suffix}"
     if recommendation.estimator is None:
         return (
             f"{goal_text}: not reached by anything that was measured; give it more "
@@ -356,8 +357,8 @@ def describe_recommendation(recommendation: Recommended, goal: float) -> str:
         else f" ({recommendation.basis})"
     )
     return (
-        f"{goal_text}: {recommendation.estimator}, {recommendation.spp} samples, {recommendation.seconds:.2g} "
-        f"s{basis}"
+        f"{goal_text}: {recommendation.estimator}, {recommendation.spp} samples, "
+        f"{recommendation.seconds:.2g} s{basis}"
     )
 
 

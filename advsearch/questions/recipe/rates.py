@@ -187,8 +187,8 @@ class ClusteredFraction:
     """Count rows of independent units, and estimate the fraction that is counted.
 
     A unit is what rows share that are not independent, such as a draw of a seed.
-    `unit_counts` (n,) of its `unit_sizes` (n,) rows are counted in each unit; in all, `n_counted` of
-    `total`. `fraction` is the mean over units of their fraction, None without rows.
+    `unit_counts` (n,) of its `unit_sizes` (n,) rows are counted in each unit; in all,
+    `n_counted` of `total`. `fraction` is the mean over units of their fraction, None without rows.
     """
 
     def __init__(

@@ -1018,7 +1018,8 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
 
 def _dip_clause(dip: Dip, unit: str) -> str:
     at_dip = f"{dip.seen[0]} of {dip.seen[1]} at {dip.distance:.3g} {unit}"
-    beyond = f"{dip.counts_beyond[0]} of {dip.counts_beyond[1]} beyond it up to {dip.until:.3g} {unit}"
+    n_beyond, n_rows_beyond = dip.counts_beyond
+    beyond = f"{n_beyond} of {n_rows_beyond} beyond it up to {dip.until:.3g} {unit}"
     return f"{at_dip}, {beyond} (p = {dip.p_value:.2g})"
 
 

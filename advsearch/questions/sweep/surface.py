@@ -27,7 +27,7 @@ from advsearch.engine.loading import fit_camera, load_scene
 from advsearch.engine.record import read_judgement
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress
-from advsearch.questions.sweep.job import SceneLoader, Job
+from advsearch.questions.sweep.job import Job, SceneLoader
 from advsearch.questions.sweep.result import count_independent
 from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
 from advsearch.report.figures import drawn

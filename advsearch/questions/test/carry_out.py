@@ -371,9 +371,9 @@ def _select_claims(
     if not selected:
         raise InputError(
             f"only: expected {ALL_COUNTEREXAMPLES} in "
-            f"{counterexamples.counterexample_directory(config.suite)}, got none, so that nothing "
-            "would be tested; keep the adversarial scene of a run with `add_counterexample`, or leave "
-            "`only` out"
+            f"{counterexamples.counterexample_directory(config.suite)}, got none, so "
+            "that nothing would be tested; keep the adversarial scene of a run with "
+            "`add_counterexample`, or leave `only` out"
         )
     return selected
 

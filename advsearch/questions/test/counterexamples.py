@@ -51,8 +51,8 @@ FINE_STEP = 1.0 / 32767.0
 COARSE_STEP = 1.0 / 255.0
 """Limits of quantization.
 
-A block of up to `MAX_FINE_VALUES` values is stored in steps of `FINE_STEP`. A larger one, such as the
-texels of a texture, has one of `FORMS`, at best in steps of `COARSE_STEP`.
+A block of up to `MAX_FINE_VALUES` values is stored in steps of `FINE_STEP`. A larger one,
+such as the texels of a texture, has one of `FORMS`, at best in steps of `COARSE_STEP`.
 """
 
 FORMS = ((True, 4), (True, 2), (True, 1), (False, 1))
