@@ -344,7 +344,9 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
     return problem
 
 
-def _check_printable(parts: AttackParts, config: SceneConfig, description: Any) -> None:
+def _check_printable(
+    parts: AttackParts, config: AttackConfig, description: Any
+) -> None:
     """Raise an error if colors are to be printed and nothing can be."""
     if config.printable:
         searched_space = make_space(parts.controls, description)

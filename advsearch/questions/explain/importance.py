@@ -223,7 +223,10 @@ class ClusteredPredictions:
         )
 
     def _weighted_residual(
-        self, group: IntArray, group_weight: FloatArray, is_used: BoolArray
+        self,
+        group: IntArray,
+        group_weight: npt.NDArray[Any],
+        is_used: npt.NDArray[np.bool_],
     ) -> FloatArray:
         """Return the weighted difference (n,) of each prediction from the rate of its group."""
         n_correct = np.bincount(group, self.weight * self.correct)
@@ -233,7 +236,7 @@ class ClusteredPredictions:
         return self.weight * (self.correct - group_rate[group])
 
     def _between_cluster_variance(
-        self, cell_cluster: IntArray, cell_residual: FloatArray
+        self, cell_cluster: IntArray, cell_residual: npt.NDArray[Any]
     ) -> float:
         """Return the variance between clusters, for each row."""
         cluster_residual = np.bincount(cell_cluster, cell_residual)

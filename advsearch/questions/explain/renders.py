@@ -261,13 +261,11 @@ class Renders:
         """Return the index of the right value that is nearest to the wrong one."""
         right_indices = np.flatnonzero(is_right).tolist()
         if self.table[factor].dtype == "category":
-            nearest = right_indices[0]
-        else:
-            nearest = min(
-                right_indices,
-                key=lambda index: abs(float(values[index]) - float(wrong_value)),
-            )
-        return nearest
+            return int(right_indices[0])
+        return min(
+            right_indices,
+            key=lambda index: abs(float(values[index]) - float(wrong_value)),
+        )
 
     def _list_thumbnails(self, name: str, numbers: Sequence[int]) -> list[str]:
         """Return the stored images of a part, as paths relative to the run directory."""

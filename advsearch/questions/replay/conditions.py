@@ -386,7 +386,7 @@ def run_replay(
 
 def _fill_table(
     context: RunContext[ReplayConfig],
-    parts: workbench.AttackParts | None,
+    parts: workbench.AttackParts,
     u: Tensor,
     config: ReplayConfig,
     conditions: Any,

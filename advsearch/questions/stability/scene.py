@@ -224,7 +224,7 @@ def _make_start(
     u: Sequence[float] | Mapping[int, float] | None, renderer: workbench.Renderer
 ) -> Tensor:
     """Return the start (d,) with some or all of its values replaced."""
-    start = renderer.start.clone()
+    start: Tensor = renderer.start.clone()
     for index, value in u.items() if isinstance(u, Mapping) else enumerate(u or ()):
         start[index] = value
     return start

@@ -197,7 +197,7 @@ def _find_parameters(
     instance: str,
 ) -> dict[str, Any]:
     """Return the parameters of a control by name."""
-    declared = [*control.declared({parameter_name: values})]
+    declared = [*control.declare_parameters({parameter_name: values})]
     if instance in instances:
         declared += instances[instance].instance_parameters
     return {parameter.name: parameter for parameter in declared}
@@ -215,7 +215,7 @@ def _parse_key_axis(name: str, values: Any, control: Any) -> Axis:
             f"{where}: expected Mitsuba's name and values, as in "
             f"{MITSUBA_CONTROL}:KEY=FIRST:LAST:COUNT"
         )
-    (parameter,) = control.declared([key])
+    (parameter,) = control.declare_parameters([key])
     return Axis(
         MITSUBA_CONTROL,
         MITSUBA_CONTROL,

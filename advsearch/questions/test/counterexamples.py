@@ -428,6 +428,8 @@ def _make_values(
     parts: workbench.AttackParts,
 ) -> dict[str, Any]:
     """Return what the file of a counterexample holds."""
+    verified = summary.verified
+    assert verified is not None
     stored_settings = {
         name: value
         for name, value in config.to_json().items()
@@ -437,11 +439,11 @@ def _make_values(
     values: dict[str, Any] = {
         "schema": 1,
         "run": path.name,
-        "said": next(iter(summary.verified.labels), ""),
+        "said": next(iter(verified.labels), ""),
         "settings": make_paths_relative(stored_settings),
         "files": directory.summary.file_digests(deciding),
         "scene": compute_scene_digest(parts.scene.description),
-        "spp": summary.verified.spp,
+        "spp": verified.spp,
     }
     return values
 

@@ -519,11 +519,12 @@ def _round_lip(outside: Array, wall: float, normal: Array) -> Array:
     lip_center = outside[-1] - wall / 2 * normal[-1]
     lip_across = wall / 2 * normal[-1]
     lip_up = np.array([-lip_across[1], lip_across[0]])
-    return (
+    lip: Array = (
         lip_center
         + np.cos(lip_angle)[:, None] * lip_across
         + np.sin(lip_angle)[:, None] * lip_up
     )
+    return lip
 
 
 def sphere(
