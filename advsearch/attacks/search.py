@@ -165,7 +165,7 @@ def search(
             first.
         seed, noise: root seeds of the search's own randomness, and of the renders; at
             least 0.
-        candidates, repeats, close: see above; they cost at most `candidates * (repeats
+        candidates, repeats, max_extra_repeats: see above; they cost at most `candidates * (repeats
             + close)` renders more.
         on_step: called after every evaluation.
         seconds: end step 1 after the first evaluation that is done later than this,
@@ -176,7 +176,7 @@ def search(
         kind: of the queries.
 
     Raises:
-        InputError: steps, candidates, repeats, close or seconds out of range, or the
+        InputError: steps, candidates, repeats, max_extra_repeats or seconds out of range, or the
             policy cannot search this domain.
         RuntimeError, ValueError: the policy left the domain or `evaluate` broke its
             contract; a bug.
@@ -189,7 +189,7 @@ def search(
             f"{candidates} and {repeats}"
         )
     if max_extra_repeats < 0:
-        raise InputError(f"close: expected at least 0, got {max_extra_repeats}")
+        raise InputError(f"max_extra_repeats: expected at least 0, got {max_extra_repeats}")
     if seconds is not None and not seconds > 0.0:
         raise InputError(f"seconds: expected a number over 0, got {seconds}")
     started = time.perf_counter()

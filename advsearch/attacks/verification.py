@@ -370,16 +370,16 @@ def verify(
     for look in looks:
         # Under conditions, clean trials that are wrong do not count: more are run.
         count = look
-        clean_trials += run_clean(trials=count, first_index=len(clean_trials))
+        clean_trials += run_clean(trials=count, n_done=len(clean_trials))
         n_missing = look - rule.count_valid(clean_trials[:count])
         while n_missing > 0 and count < looks[-1]:
             count = min(count + n_missing, looks[-1])
-            clean_trials += run_clean(trials=count, first_index=len(clean_trials))
+            clean_trials += run_clean(trials=count, n_done=len(clean_trials))
             n_missing = look - rule.count_valid(clean_trials[:count])
         done += run(
             u,
             trials=count,
-            first_index=len(done),
+            n_done=len(done),
             kind=kind,
             n_images=n_images,
             is_decided=until,

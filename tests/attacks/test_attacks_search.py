@@ -584,7 +584,7 @@ def test_a_gradient_that_is_missing_or_misshapen_is_a_bug(gradient: Tensor | Non
         ({"steps": 0}, "steps: expected at least 1, got 0"),
         ({"steps": 1, "candidates": -1}, "candidates and repeats"),
         ({"steps": 1, "repeats": 0}, "candidates and repeats"),
-        ({"steps": 1, "close": -1}, "close: expected at least 0"),
+        ({"steps": 1, "max_extra_repeats": -1}, "max_extra_repeats: expected at least 0"),
         ({"steps": 1, "seconds": 0.0}, "seconds: expected a number over 0, got 0.0"),
         ({"steps": 1, "seconds": math.nan}, "seconds: expected a number over 0, got nan"),
     ],

@@ -118,7 +118,7 @@ def test_a_scene_to_train_on_is_rendered_with_one_control_moved_and_with_all(
             wanted.append(u[: len(start)])
             return torch.zeros((16, 16, 3))
 
-    monkeypatch.setattr(type(problem.renderer), "like", lambda self, **changes: Recorder())
+    monkeypatch.setattr(type(problem.renderer), "copy_with", lambda self, **changes: Recorder())
     found = [one for seed in range(30) for one in make_lessons(problem, 1, seed)]
     assert {len(one.images) for one in found if isinstance(one, RenderedLesson)} == {1} and len(wanted) == 60
     moved = [(bool((u != start)[:pose].any()), bool((u != start)[pose:].any())) for u in wanted]
@@ -151,7 +151,7 @@ def test_a_lesson_of_a_texture_comes_back_from_a_worker(form: str) -> None:
     config = AttackConfig(object="mug", resolution=(16, 16), controls=controls, over={"camera": {}}, measure="no")
     (lesson,) = make_lessons(make_problem_on(config, load_scene("mug"), load_model("reference")), 1, 0)
     returned = pickle.loads(pickle.dumps(lesson))
-    assert isinstance(lesson, TextureLesson) and torch.equal(returned.worst, lesson.worst_image)
+    assert isinstance(lesson, TextureLesson) and torch.equal(returned.worst_image, lesson.worst_image)
 
 
 def test_an_epoch_looks_six_times_at_a_scene_with_a_texture() -> None:
