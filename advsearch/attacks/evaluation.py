@@ -229,7 +229,7 @@ class Proposal:
 @dataclass(frozen=True)
 class Counts:
     """What a policy had to do about evaluations, for the summary of a run: gradients of
-    which single numbers were outliers and cut (`pgd.clipped`), those shortened as a
+    which single numbers were outliers and cut (`pgd.clip_gradient`), those shortened as a
     whole, and steps that were taken back (`rejected`).
     """
 
@@ -361,7 +361,7 @@ def seeded(seed: int, number: int) -> torch.Generator:
 
 
 @contextmanager
-def use_one_thread() -> Iterator[None]:
+def limit_to_single_thread() -> Iterator[None]:
     """Let torch use one thread for a while: faster for small matrices, on a busy
     machine many times so, and the last bits are the same whatever the number of
     threads. Setting the number costs less than a microsecond.
