@@ -293,10 +293,10 @@ class PGD(AscentPolicy):
     In a domain without noise (`Domain.exact`) no gradient is clipped, and the step size
     falls in a line over the planned steps, which came farther than Auto-PGD's rule at
     every budget that was tried (docs/policies/pgd.md). It is halved besides after a
-    window that added less than `MIN_WINDOW_GAIN` of what the search has gained; after `MAX_IDLE_WINDOWS` of
-    these in a row there is nothing more to propose. In one whose evaluations draw
-    conditions from a bank (`Domain.drawn`) the step size falls likewise, and no window
-    is looked at: what one gained says what it drew.
+    window that added less than `MIN_WINDOW_GAIN` of what the search has gained; after
+    `MAX_IDLE_WINDOWS` of these in a row there is nothing more to propose. Where
+    evaluations sample conditions (`Domain.draws_conditions`) the step size falls
+    likewise, and windows are ignored: what one gained depends on its conditions.
 
     An evaluation with the objective -inf sends the search back to its best
     configuration, which is evaluated again and left with half the step size. A gradient
