@@ -74,9 +74,9 @@ def add_candidate(
     """
     for old in pool:
         if torch.equal(old.u, new.u):
-            looked = old.with_repeat(new.objective, new.success)
+            updated = old.with_repeat(new.objective, new.success)
             return tuple(
-                looked if candidate is old else candidate for candidate in pool
+                updated if candidate is old else candidate for candidate in pool
             )
     if len(pool) >= size and _sort_key(new) <= _sort_key(pool[-1]):
         return pool
@@ -113,8 +113,8 @@ def select_contenders(
         return pool
     leader = select_best(pool)
 
-    def worse(candidate: Candidate) -> bool:
-        behind = [
+    def is_worse(candidate: Candidate) -> bool:
+        differences = [
             a - b
             for a, b in zip(
                 leader.repeat_objectives[-shared:],
@@ -122,22 +122,27 @@ def select_contenders(
                 strict=True,
             )
         ]
-        if not all(map(math.isfinite, behind)):
+        if not all(map(math.isfinite, differences)):
             return not math.isfinite(candidate.mean_objective)
-        mean = math.fsum(behind) / shared
-        variance = math.fsum((each - mean) ** 2 for each in behind) / (shared - 1)
+        mean = math.fsum(differences) / shared
+        variance = math.fsum((difference - mean) ** 2 for difference in differences) / (
+            shared - 1
+        )
         return candidate.success_rate <= leader.success_rate and mean > math.sqrt(
             variance / shared
         )
 
     return tuple(
-        candidate for candidate in pool if candidate is leader or not worse(candidate)
+        candidate
+        for candidate in pool
+        if candidate is leader or not is_worse(candidate)
     )
 
 
 def select_best(pool: tuple[Candidate, ...]) -> Candidate:
-    """Return the winner: by success rate, then by objective, of new renders where all
-    have had some.
+    """Return the best candidate: by success rate, then by mean objective.
+
+    Only new renders count, if all candidates have some.
     """
     if all(candidate.repeat_objectives for candidate in pool):
         return max(
@@ -419,13 +424,13 @@ def find_smallest_change(
         if state.high <= RATIO**2 * state.low:
             scale = max(scale, state.high / RATIO)
         u = search(scale_domain(domain, scale), state.searches)
-        passed = passes(u, state.checks)
-        if passed:
+        has_passed = passes(u, state.checks)
+        if has_passed:
             state = replace(state, found_by=state.searches)
         state = replace(state, searches=state.searches + 1, checks=state.checks + 1)
         state = (
             _shorten(state, u, scale, passes, domain, likely)
-            if passed
+            if has_passed
             else replace(state, low=scale)
         )
     return state
@@ -441,18 +446,18 @@ def confirm_bracket(
     """
     if bracket.u is None:
         return bracket
-    edge = bracket.u
-    reached = bracket.high
-    at = 1.0
+    shortest_u = bracket.u
+    shortest_scale = bracket.high
+    growth = 1.0
     for _ in range(ATTEMPTS):
-        if all(passes(bracket.u, bracket.checks + again) for again in range(times)):
+        if all(passes(bracket.u, bracket.checks + repeat) for repeat in range(times)):
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
-        at *= math.sqrt(RATIO)
-        high = min(1.0, reached * at)
-        farther = scale_domain(domain, high).project(
-            domain.start + at * (edge - domain.start)
+        growth *= math.sqrt(RATIO)
+        scale = min(1.0, shortest_scale * growth)
+        grown_u = scale_domain(domain, scale).project(
+            domain.start + growth * (shortest_u - domain.start)
         )
-        bracket = replace(bracket, high=high, u=farther, checks=bracket.checks + times)
+        bracket = replace(bracket, high=scale, u=grown_u, checks=bracket.checks + times)
     return bracket
 
 
@@ -464,34 +469,39 @@ def _shorten(
     domain: Domain,
     likely: Guess | None,
 ) -> Bracket:
-    """Bisect the length of a configuration that passes until the ends are within
-    `LENGTH_RATIO`.
+    """Bisect the length of a configuration that passes.
 
-    With a guess it is tried first at the shortest length of which that says that it
-    passes, and then farther and farther from there, but never beyond the middle.
+    It ends when the bounds are within `LENGTH_RATIO` of each other. With `likely`, the
+    first length tried is the shortest that it takes for passing; steps from there grow,
+    but never beyond the middle of the bounds.
     """
     low = max(state.low, SMALLEST_SCALE * length)
     high = length
-    shortest = u
+    shortest_u = u
     checks = state.checks
 
-    def at(scale: float) -> Tensor:
+    def shrink_to(scale: float) -> Tensor:
+        """Return the configuration at a scale of the budgets."""
         return shrink_towards_start(scale_domain(domain, scale), u, scale / length)
 
     middle = math.sqrt(high * low)
     stride = math.inf
     if likely is not None:
-        least = low
-        most = high
+        guess_low = low
+        guess_high = high
         stride = LENGTH_RATIO
-        while most > LENGTH_RATIO * least:
-            middle = math.sqrt(most * least)
-            least, most = (least, middle) if likely(at(middle)) else (middle, most)
-        middle = math.sqrt(most * least)
+        while guess_high > LENGTH_RATIO * guess_low:
+            middle = math.sqrt(guess_high * guess_low)
+            guess_low, guess_high = (
+                (guess_low, middle)
+                if likely(shrink_to(middle))
+                else (middle, guess_high)
+            )
+        middle = math.sqrt(guess_high * guess_low)
     while high > LENGTH_RATIO * low:
-        shorter = at(middle)
-        if passes(shorter, checks):
-            shortest = shorter
+        shorter_u = shrink_to(middle)
+        if passes(shorter_u, checks):
+            shortest_u = shorter_u
             high = middle
             middle = max(math.sqrt(high * low), high / stride)
         else:
@@ -499,4 +509,4 @@ def _shorten(
             middle = min(math.sqrt(high * low), low * stride)
         stride = stride * stride
         checks = checks + 1
-    return replace(state, high=high, u=shortest, checks=checks)
+    return replace(state, high=high, u=shortest_u, checks=checks)

@@ -217,14 +217,14 @@ def _isolate_numpy_random(seed: int, generation: int) -> Iterator[None]:
     """Let pycma draw numbers of its own from numpy's global generator, and put that
     back; its warnings are not ours.
     """
-    before = np.random.get_state()  # noqa: NPY002
+    state_before = np.random.get_state()  # noqa: NPY002
     np.random.seed(stream(seed, "pycma", generation))  # noqa: NPY002
     try:
         with warnings.catch_warnings(), limit_to_single_thread():
             warnings.simplefilter("ignore")
             yield
     finally:
-        np.random.set_state(before)  # noqa: NPY002
+        np.random.set_state(state_before)  # noqa: NPY002
 
 
 @dataclass(frozen=True, eq=False)
