@@ -52,7 +52,13 @@ def test_conditions_are_stratified_and_numbered() -> None:
 
 def grow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let it compare every six evaluations, and go on growing after each comparison."""
-    for name, value in {"EVERY": 6, "UNSEEN": 2, "SURE": -1e9, "FIRST": 3, "GROWTH": 4}.items():
+    for name, value in {
+        "COMPARISON_INTERVAL": 6,
+        "N_COMPARED": 2,
+        "MIN_STANDARD_ERRORS": -1e9,
+        "INITIAL_CONDITIONS": 3,
+        "DRAWS_PER_CONDITION": 4,
+    }.items():
         monkeypatch.setattr(bank, name, value)
     monkeypatch.setattr(acceptance, "CHECK_SPP", 4)
     monkeypatch.setattr(surface_renderer, "find_refusal", lambda renderer, varying: Refusal("matrices are tested"))
