@@ -81,7 +81,7 @@ class Drawn:
     root: int
     over: bool = False
     spp: int = 16
-    draws: int = 1
+    n_draws: int = 1
     steps: int = 100
     seed: int = field(init=False)
     rule: Rule = field(init=False)
@@ -109,10 +109,10 @@ class Drawn:
     def evaluate_all(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         return map(self.evaluate, queries)
 
-    def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Any]:
+    def describe(self, u: Tensor, draw_seed: int | None = None) -> dict[str, Any]:
         return {}
 
-    def conditions_of(self, u: Tensor, seed: int) -> dict[str, Any]:
+    def describe_conditions(self, u: Tensor, draw_seed: int) -> dict[str, Any]:
         return {}
 
 

@@ -109,7 +109,7 @@ def attack_on(
     run: RunDirectory | None = None,
 ) -> RunState:
     """Attack a problem of one's own as a configuration describes it."""
-    problem.steps, problem.draws = choose_search_size(config, problem)
+    problem.steps, problem.n_draws = choose_search_size(config, problem)
     return search_and_verify(
         policy,
         Journal(run, ParallelEvaluator(problem)),

@@ -178,14 +178,18 @@ def _find_dark_squares(light: Floats) -> list[tuple[float, float, int]]:
     squares = []
     boxes = ndimage.find_objects(labels) if count else []
     for label, (rows, columns) in enumerate(boxes, 1):
-        height = rows.stop - rows.start
-        width = columns.stop - columns.start
         inside = labels[rows, columns] == label
-        is_square = 0.5 < width / height < 2.0
-        if min(height, width) >= 5 and is_square and inside.mean() > 0.7:
+        if _is_filled_square(inside):
             y, x = np.argwhere(inside).mean(axis=0)
             squares.append((x + columns.start, y + rows.start, inside.sum()))
     return squares
+
+
+def _is_filled_square(inside: npt.NDArray[np.bool_]) -> bool:
+    """Return whether a region (H, W) bool fills its box, which is about a square."""
+    height, width = inside.shape
+    is_square = 0.5 < width / height < 2.0
+    return min(height, width) >= 5 and is_square and bool(inside.mean() > 0.7)
 
 
 def _compute_homography(points: Floats, pixels: Floats) -> Floats:

@@ -36,7 +36,7 @@ from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
 from advsearch.runs.files import read_png, to_8bit
 from advsearch.scene.assembly import IMAGE_INPUTS, pose_mesh
 from advsearch.scene.assets import Float32Array, Float64Array, IntArray, Mesh, Shape
-from advsearch.scene.description import NO_ENVIRONMENT, OBJECT
+from advsearch.scene.description import NO_ENVIRONMENT, OBJECT, SceneDescription
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import compute_doubled_areas, rasterize_charts
 
@@ -199,21 +199,40 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
             name = f"{control.name}, {patch_size:.1f} mm a side"
             pieces.append(_make_piece(name, pixels, (pixel_size, pixel_size), None))
         elif isinstance(control, TextureControl) and texture_file.is_file():
-            mesh = control.get_mesh(scene.description).mesh
-            materials = control.list_materials(scene.description)
-            faces = None
-            if materials is not None:
-                faces = np.concatenate([mesh.materials[name] for name in materials])
-            vertices = scene.description.object.mesh.vertices
-            scale = size / float(np.ptp(vertices, axis=0).max())
-            texture = read_png(texture_file)
-            pieces.extend(_find_charts(control.name, texture, mesh, faces, scale))
+            pieces.extend(
+                _make_texture_pieces(control, scene.description, texture_file, size)
+            )
     if not pieces:
         raise InputError(
             f"{folder}: it has neither a texture nor a patch, so that "
             "there is nothing to print"
         )
     return pieces
+
+
+def _make_texture_pieces(
+    control: TextureControl,
+    description: SceneDescription,
+    texture_file: Path,
+    size: float,
+) -> Iterator[Piece]:
+    """Return a piece for each connected part of the unwrapped surface of a texture.
+
+    Args:
+        control: of the texture.
+        description: of the scene.
+        texture_file: PNG file of the texture.
+        size: longest side of the real object in millimetres.
+    """
+    mesh = control.get_mesh(description).mesh
+    materials = control.list_materials(description)
+    faces = None
+    if materials is not None:
+        faces = np.concatenate([mesh.materials[name] for name in materials])
+    vertices = description.object.mesh.vertices
+    scale = size / float(np.ptp(vertices, axis=0).max())
+    texture = read_png(texture_file)
+    return _find_charts(control.name, texture, mesh, faces, scale)
 
 
 def _get_relative_patch_size(

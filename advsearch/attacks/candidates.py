@@ -74,19 +74,19 @@ def add_candidate(
     """
     for old in pool:
         if torch.equal(old.u, new.u):
-            looked = old.with_repeat(new.objective, new.success)
+            updated = old.with_repeat(new.objective, new.success)
             return tuple(
-                looked if candidate is old else candidate for candidate in pool
+                updated if candidate is old else candidate for candidate in pool
             )
-    if len(pool) >= size and _raw(new) <= _raw(pool[-1]):
+    if len(pool) >= size and _sort_key(new) <= _sort_key(pool[-1]):
         return pool
     for old in pool:
         if float((old.u - new.u).abs().amax()) < SAME:
-            if _raw(new) <= _raw(old):
+            if _sort_key(new) <= _sort_key(old):
                 return pool
             pool = tuple(candidate for candidate in pool if candidate is not old)
             break
-    return tuple(sorted((*pool, new), key=_raw, reverse=True)[:size])
+    return tuple(sorted((*pool, new), key=_sort_key, reverse=True)[:size])
 
 
 def replace_worst(
@@ -113,8 +113,8 @@ def select_contenders(
         return pool
     leader = select_best(pool)
 
-    def worse(candidate: Candidate) -> bool:
-        behind = [
+    def is_worse(candidate: Candidate) -> bool:
+        differences = [
             a - b
             for a, b in zip(
                 leader.repeat_objectives[-shared:],
@@ -122,22 +122,27 @@ def select_contenders(
                 strict=True,
             )
         ]
-        if not all(map(math.isfinite, behind)):
+        if not all(map(math.isfinite, differences)):
             return not math.isfinite(candidate.mean_objective)
-        mean = math.fsum(behind) / shared
-        variance = math.fsum((each - mean) ** 2 for each in behind) / (shared - 1)
+        mean = math.fsum(differences) / shared
+        variance = math.fsum((difference - mean) ** 2 for difference in differences) / (
+            shared - 1
+        )
         return candidate.success_rate <= leader.success_rate and mean > math.sqrt(
             variance / shared
         )
 
     return tuple(
-        candidate for candidate in pool if candidate is leader or not worse(candidate)
+        candidate
+        for candidate in pool
+        if candidate is leader or not is_worse(candidate)
     )
 
 
 def select_best(pool: tuple[Candidate, ...]) -> Candidate:
-    """Return the winner: by success rate, then by objective, of new renders where all
-    have had some.
+    """Return the best candidate: by success rate, then by mean objective.
+
+    Only new renders count, if all candidates have some.
     """
     if all(candidate.repeat_objectives for candidate in pool):
         return max(
@@ -147,21 +152,21 @@ def select_best(pool: tuple[Candidate, ...]) -> Candidate:
     return pool[0]
 
 
-def _raw(candidate: Candidate) -> tuple[bool, float]:
+def _sort_key(candidate: Candidate) -> tuple[bool, float]:
     return candidate.success, candidate.objective
 
 
 # with fewer failures than so many, each of equal weight, no estimate is stated
-LEAST_EFFECTIVE = 10.0
+MIN_EFFECTIVE_FAILURES = 10.0
 # sizes of a bet, each half of the one before; the capital is shared equally among them
-BETS = 8
+N_BETS = 8
 
 
 @dataclass(frozen=True)
 class FailureRate:
     """The share of configurations, drawn evenly from the budget, in which one render of
     the search is a success: the mean of the weighted draws (None where `effective` is
-    under `LEAST_EFFECTIVE`, or a draw could not be evaluated); an interval that covers
+    under `MIN_EFFECTIVE_FAILURES`, or a draw could not be evaluated); an interval that covers
     the share in 95 % at least, however the draws were adapted, at any number of them;
     and how many failures of equal weight would be worth as much: (sum w)^2 / sum w^2
     (Kish 1965).
@@ -199,8 +204,8 @@ def estimate_failure_rate(
     bounds = bounds.double()
     low = weights * (failed & ~unknown)
     high = weights * (failed | unknown)
-    sizes = 0.5 ** torch.arange(BETS, dtype=torch.float64)[:, None]
-    limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(BETS)
+    sizes = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]
+    limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(N_BETS)
 
     def against_low(p: float) -> bool:
         return (
@@ -220,7 +225,7 @@ def estimate_failure_rate(
 
     total = float(low.sum())
     effective = total**2 / float(low.square().sum()) if total else 0.0
-    stated = effective >= LEAST_EFFECTIVE and not bool(unknown.any())
+    stated = effective >= MIN_EFFECTIVE_FAILURES and not bool(unknown.any())
     ends = find_threshold(lambda p: not against_low(p)), find_threshold(against_high)
     return FailureRate(
         min(1.0, total / len(low)) if stated else None, ends, effective, len(low)
@@ -265,26 +270,41 @@ def select_diverse(
     is_discrete: Tensor,
     limit: int = MOST,
 ) -> list[int]:
-    """Return which to list, at places (n, k) in shares of each range: the worst first,
-    then each time the one that is farthest from all before it. That is the greedy
-    choice of k centres, whose largest distance is at most twice the least possible
-    (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance"). The
-    ends of ranges `is_periodic` (k,) are the same place; different choices, `is_discrete` (k,),
-    lie 1 apart. Of equals the worse one goes first.
+    """Return the indices of points that differ most, the worst first.
+
+    After the worst, each is the farthest from all before it; of equally far points the
+    worse goes first. This is the greedy choice of k centers, whose largest distance is
+    at most twice the smallest possible (Gonzalez 1985, "Clustering to minimize the
+    maximum intercluster distance").
+
+    Args:
+        points: (n, k), in fractions of each range.
+        objectives: of the points; the larger the worse.
+        is_periodic: (k,) bool, ranges whose bounds are the same value.
+        is_discrete: (k,) bool, discrete choices: different options lie 1 apart.
+        limit: maximum number of indices.
     """
     order = sorted(range(len(points)), key=lambda number: -objectives[number])
     points = points[order].double()
-    nearest = torch.full((len(points),), torch.inf, dtype=torch.float64)
-    picked = list[int]()
+    nearest_distance = torch.full((len(points),), torch.inf, dtype=torch.float64)
+    selected = list[int]()
     for _ in range(min(limit, len(points))):
-        chosen = int(nearest.argmax())
-        picked.append(chosen)
-        away = (points - points[chosen]).abs()
-        away = torch.where(is_periodic, torch.minimum(away, 1.0 - away), away)
-        away = torch.where(is_discrete, (away > 0.0).double(), away)
-        nearest = torch.minimum(nearest, away.norm(dim=1))
-        nearest[picked] = -1.0
-    return [order[number] for number in picked]
+        farthest = int(nearest_distance.argmax())
+        selected.append(farthest)
+        distance_to_chosen = (points - points[farthest]).abs()
+        distance_to_chosen = torch.where(
+            is_periodic,
+            torch.minimum(distance_to_chosen, 1.0 - distance_to_chosen),
+            distance_to_chosen,
+        )
+        distance_to_chosen = torch.where(
+            is_discrete, (distance_to_chosen > 0.0).double(), distance_to_chosen
+        )
+        nearest_distance = torch.minimum(
+            nearest_distance, distance_to_chosen.norm(dim=1)
+        )
+        nearest_distance[selected] = -1.0
+    return [order[number] for number in selected]
 
 
 RATIO = 1.05  # the bracket is closed once high / low is at most this
@@ -294,13 +314,13 @@ ROUNDS = 12
 
 ATTEMPTS = 6  # steps outwards that the confirmation of the upper end takes at most
 
-SHORTENED = 1.0 + (RATIO - 1.0) / 5.0
+LENGTH_RATIO = 1.0 + (RATIO - 1.0) / 5.0
 """A configuration's length is bisected until the ends are within this: a fifth of the
 bracket's ratio.
 """
 
 MOST_CHECKS = 1 + math.ceil(
-    math.log2(math.log(1.0 / SMALLEST_SCALE) / math.log(SHORTENED))
+    math.log2(math.log(1.0 / SMALLEST_SCALE) / math.log(LENGTH_RATIO))
 )
 """Configurations that go through the trials after a search, at most: what it found, and
 those of the bisection.
@@ -314,7 +334,7 @@ seeds.
 Passes = Callable[[Tensor, int], bool]
 """(u, check) -> whether a configuration passes the trials; check numbers its seeds."""
 
-Likely = Callable[[Tensor], bool]
+Guess = Callable[[Tensor], bool]
 """u -> whether a configuration would probably pass: a guess that costs next to
 nothing.
 """
@@ -367,7 +387,7 @@ def shrink_towards_start(domain: Domain, u: Tensor, scale: float) -> Tensor:
 
 
 def find_smallest_change(
-    search: Search, passes: Passes, domain: Domain, likely: Likely | None = None
+    search: Search, passes: Passes, domain: Domain, likely: Guess | None = None
 ) -> Bracket:
     """Bracket the smallest scale of the domain's budgets at which a configuration
     passes.
@@ -404,13 +424,13 @@ def find_smallest_change(
         if state.high <= RATIO**2 * state.low:
             scale = max(scale, state.high / RATIO)
         u = search(scale_domain(domain, scale), state.searches)
-        passed = passes(u, state.checks)
-        if passed:
+        has_passed = passes(u, state.checks)
+        if has_passed:
             state = replace(state, found_by=state.searches)
         state = replace(state, searches=state.searches + 1, checks=state.checks + 1)
         state = (
             _shorten(state, u, scale, passes, domain, likely)
-            if passed
+            if has_passed
             else replace(state, low=scale)
         )
     return state
@@ -426,18 +446,18 @@ def confirm_bracket(
     """
     if bracket.u is None:
         return bracket
-    edge = bracket.u
-    reached = bracket.high
-    at = 1.0
+    shortest_u = bracket.u
+    shortest_scale = bracket.high
+    growth = 1.0
     for _ in range(ATTEMPTS):
-        if all(passes(bracket.u, bracket.checks + again) for again in range(times)):
+        if all(passes(bracket.u, bracket.checks + repeat) for repeat in range(times)):
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
-        at *= math.sqrt(RATIO)
-        high = min(1.0, reached * at)
-        farther = scale_domain(domain, high).project(
-            domain.start + at * (edge - domain.start)
+        growth *= math.sqrt(RATIO)
+        scale = min(1.0, shortest_scale * growth)
+        grown_u = scale_domain(domain, scale).project(
+            domain.start + growth * (shortest_u - domain.start)
         )
-        bracket = replace(bracket, high=high, u=farther, checks=bracket.checks + times)
+        bracket = replace(bracket, high=scale, u=grown_u, checks=bracket.checks + times)
     return bracket
 
 
@@ -447,36 +467,41 @@ def _shorten(
     length: float,
     passes: Passes,
     domain: Domain,
-    likely: Likely | None,
+    likely: Guess | None,
 ) -> Bracket:
-    """Bisect the length of a configuration that passes until the ends are within
-    `SHORTENED`.
+    """Bisect the length of a configuration that passes.
 
-    With a guess it is tried first at the shortest length of which that says that it
-    passes, and then farther and farther from there, but never beyond the middle.
+    It ends when the bounds are within `LENGTH_RATIO` of each other. With `likely`, the
+    first length tried is the shortest that it takes for passing; steps from there grow,
+    but never beyond the middle of the bounds.
     """
     low = max(state.low, SMALLEST_SCALE * length)
     high = length
-    shortest = u
+    shortest_u = u
     checks = state.checks
 
-    def at(scale: float) -> Tensor:
+    def shrink_to(scale: float) -> Tensor:
+        """Return the configuration at a scale of the budgets."""
         return shrink_towards_start(scale_domain(domain, scale), u, scale / length)
 
     middle = math.sqrt(high * low)
     stride = math.inf
     if likely is not None:
-        least = low
-        most = high
-        stride = SHORTENED
-        while most > SHORTENED * least:
-            middle = math.sqrt(most * least)
-            least, most = (least, middle) if likely(at(middle)) else (middle, most)
-        middle = math.sqrt(most * least)
-    while high > SHORTENED * low:
-        shorter = at(middle)
-        if passes(shorter, checks):
-            shortest = shorter
+        guess_low = low
+        guess_high = high
+        stride = LENGTH_RATIO
+        while guess_high > LENGTH_RATIO * guess_low:
+            middle = math.sqrt(guess_high * guess_low)
+            guess_low, guess_high = (
+                (guess_low, middle)
+                if likely(shrink_to(middle))
+                else (middle, guess_high)
+            )
+        middle = math.sqrt(guess_high * guess_low)
+    while high > LENGTH_RATIO * low:
+        shorter_u = shrink_to(middle)
+        if passes(shorter_u, checks):
+            shortest_u = shorter_u
             high = middle
             middle = max(math.sqrt(high * low), high / stride)
         else:
@@ -484,4 +509,4 @@ def _shorten(
             middle = min(math.sqrt(high * low), low * stride)
         stride = stride * stride
         checks = checks + 1
-    return replace(state, high=high, u=shortest, checks=checks)
+    return replace(state, high=high, u=shortest_u, checks=checks)

@@ -95,14 +95,9 @@ class Block:
                 f"block{where}: expected a reach over 0 and norm 'box', got "
                 f"{self.reach} and {self.norm!r}"
             )
-        whole = (self.size, self.norm, self.low, self.high, self.periodic) == (
-            1,
-            "box",
-            0.0,
-            1.0,
-            False,
-        )
-        if self.options and (self.options < 0 or not whole):
+        has_full_range = self.low == 0.0 and self.high == 1.0 and not self.periodic
+        is_plain_number = self.size == 1 and self.norm == "box" and has_full_range
+        if self.options and (self.options < 0 or not is_plain_number):
             raise InputError(
                 f"block{where}: expected a discrete choice to have at least one "
                 "option, size 1, norm 'box' and "
@@ -186,7 +181,8 @@ class Domain:
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
         for block, part in self.list_block_slices():
-            lower[part], upper[part] = block.low, block.high
+            lower[part] = block.low
+            upper[part] = block.high
             if not bool(
                 ((start[part] >= lower[part]) & (start[part] <= upper[part])).all()
             ):
@@ -319,7 +315,7 @@ class Domain:
           random signs. A "box" has no such place (the corners of a range of poses are
           no worse than its middle) and is sampled as before.
         """
-        drawn = []
+        samples = []
         for _ in range(n):
             u = torch.empty_like(self.start)
             for block, part in self.list_block_slices():
@@ -331,8 +327,8 @@ class Domain:
                 if block.norm != "l2" or block.epsilon is None:
                     u[part] = torch.lerp(self.lower[part], self.upper[part], noise)
                 elif extreme:  # far beyond the ball, in a direction of random signs
-                    far = 2.0 * max(block.epsilon, math.sqrt(block.size))
-                    u[part] = self.start[part] + (noise * 2.0 - 1.0) * far
+                    far_distance = 2.0 * max(block.epsilon, math.sqrt(block.size))
+                    u[part] = self.start[part] + (noise * 2.0 - 1.0) * far_distance
                 else:  # uniform in the ball (Muller 1959)
                     direction = torch.randn(block.size, generator=generator)
                     length = block.epsilon * math.pow(float(noise[0]), 1.0 / block.size)
@@ -340,8 +336,8 @@ class Domain:
                         float(torch.linalg.vector_norm(direction)), 1e-30
                     )
                     u[part] = self.start[part] + direction
-            drawn.append(self.project(u))
-        return torch.stack(drawn)
+            samples.append(self.project(u))
+        return torch.stack(samples)
 
     def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
         """Return one whole step (d,) from u uphill: the displacement that a linear
@@ -387,7 +383,7 @@ def option_center(u: Tensor, options: Tensor | int) -> Tensor:
 CHUNK = 32768
 # a norm at most this fraction over the radius counts as inside, so that projecting
 # twice changes nothing
-SLACK = 1e-6
+ROUNDING_SLACK = 1e-6
 
 _MAX_ITERATIONS = 100
 
@@ -429,7 +425,7 @@ def project_l2_box(
         rooms.append(u_chunk.clamp(low, high).sub_(center_chunk).square_())
         squared_distance += float(squares[-1].sum(dtype=torch.float64))
         squared_distance_in_box += float(rooms[-1].sum(dtype=torch.float64))
-    if squared_distance_in_box <= (radius * (1.0 + SLACK)) ** 2:
+    if squared_distance_in_box <= (radius * (1.0 + ROUNDING_SLACK)) ** 2:
         return u.clamp(low, high)
     s = _solve_multiplier(squares, rooms, radius, radius**2 / squared_distance)
     return _move_towards(center, u, math.sqrt(s), low, high)
@@ -574,10 +570,11 @@ class SampleSequence:
         self._name = name
         rows = max(1, min(NET, MAX_BLOCK_VALUES // max(1, dimensions)))
         self._rows = 1 << (rows.bit_length() - 1)
-        self._number, self._block = -1, np.empty((0, dimensions))
+        self._block_index = -1
+        self._block = np.empty((0, dimensions))
         self._engine: Any = None
         self._net = -1
-        self._drawn = 0
+        self._n_sampled = 0
 
     def points(self, first: int, count: int) -> Float64Array:
         """Return the draws with the numbers from `first` on: (count, dimensions)
@@ -585,37 +582,42 @@ class SampleSequence:
         """
         if not self.dimensions or count < 1:
             return np.empty((max(0, count), self.dimensions))
-        parts = []
+        blocks = []
         end = first + count
         while first < end:
-            number, begin = divmod(first, self._rows)
-            size = min(self._rows - begin, end - first)
-            if number != self._number:
-                rng = np.random.default_rng(stream(self._seed, self._name, number))
+            block_index, first_row = divmod(first, self._rows)
+            n_rows = min(self._rows - first_row, end - first)
+            if block_index != self._block_index:
+                rng = np.random.default_rng(stream(self._seed, self._name, block_index))
                 shape = (self._rows, self.dimensions)
                 self._block = (
-                    self._sobol(number)
+                    self._sample_sobol(block_index)
                     if self._sampler == "sobol"
                     else rng.random(shape)
                 )
-                self._number = number
-            parts.append(self._block[begin : begin + size])
-            first += size
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+                self._block_index = block_index
+            blocks.append(self._block[first_row : first_row + n_rows])
+            first += n_rows
+        return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
 
-    def _sobol(self, number: int) -> Float64Array:
+    def _sample_sobol(self, block_index: int) -> Float64Array:
+        """Return a block of points of a scrambled Sobol net, (rows, dimensions)."""
         # takes a quarter of a second, and few runs draw from nets
         from scipy.stats import qmc
 
-        net, within = divmod(number * self._rows, NET)
-        if net != self._net or self._engine is None or within < self._drawn:
-            seed = stream(self._seed, self._name, net)
+        net_index, first_row = divmod(block_index * self._rows, NET)
+        if (
+            net_index != self._net
+            or self._engine is None
+            or first_row < self._n_sampled
+        ):
+            seed = stream(self._seed, self._name, net_index)
             self._engine = qmc.Sobol(self.dimensions, scramble=True, seed=seed)
-            self._net = net
-            self._drawn = 0
-        if within > self._drawn:
-            self._engine.fast_forward(within - self._drawn)
-        self._drawn = within + self._rows
+            self._net = net_index
+            self._n_sampled = 0
+        if first_row > self._n_sampled:
+            self._engine.fast_forward(first_row - self._n_sampled)
+        self._n_sampled = first_row + self._rows
         return np.asarray(self._engine.random(self._rows))
 
 
@@ -627,19 +629,19 @@ class SeedSequence:
     def __init__(self, root: int, name: str) -> None:
         self._root = root
         self._name = name
-        self._number = -1
+        self._block_index = -1
         self._block: NDArray[Any] = np.empty(0, dtype=np.uint32)
 
     def __call__(self, index: int) -> int:
         """Return seed number `index`, in [0, 2**32)."""
-        number, place = divmod(index, SEEDS)
-        if number != self._number:
-            sequence = np.random.SeedSequence(stream(self._root, self._name, number))
-            self._number, self._block = (
-                number,
-                sequence.generate_state(SEEDS, dtype=np.uint32),
+        block_index, position = divmod(index, SEEDS)
+        if block_index != self._block_index:
+            sequence = np.random.SeedSequence(
+                stream(self._root, self._name, block_index)
             )
-        return int(self._block[place])
+            self._block_index = block_index
+            self._block = sequence.generate_state(SEEDS, dtype=np.uint32)
+        return int(self._block[position])
 
 
 @dataclass(frozen=True)

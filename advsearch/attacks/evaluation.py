@@ -40,15 +40,13 @@ together, at most.
 
 
 def max_batch_size(dim: int) -> int:
-    """Return how many configurations of so many numbers are asked about at once, at
-    most.
-    """
+    """Return the maximum number of queries in a batch, for configurations (dim,)."""
     return max(2, min(MAX_QUERIES, MAX_COORDINATES // dim))
 
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """One question: what does the model say of this configuration under this noise?
+    """A configuration to render and evaluate, under the noise of a seed.
 
     A query of a search is about the picture as it is rendered, at the search's own
     samples and light paths, and over the conditions that it draws. A trial is about the
@@ -163,17 +161,19 @@ class Evaluation:
         if gradient is not None and not math.isfinite(
             float(gradient.sum(dtype=torch.float64))
         ):
-            if bad := int((~torch.isfinite(gradient)).sum()):
+            if n_bad := int((~torch.isfinite(gradient)).sum()):
                 gradient = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
                 evaluation = replace(
                     evaluation,
                     gradient=gradient,
-                    non_finite=evaluation.non_finite + bad,
+                    non_finite=evaluation.non_finite + n_bad,
                 )
         if evaluation.is_finite:
             return evaluation
-        zero = None if gradient is None else torch.zeros_like(gradient)
-        return replace(evaluation, objective=-math.inf, gradient=zero, success=False)
+        zero_gradient = None if gradient is None else torch.zeros_like(gradient)
+        return replace(
+            evaluation, objective=-math.inf, gradient=zero_gradient, success=False
+        )
 
 
 Evaluate = Callable[[Sequence[Query]], Iterable[Evaluation]]
@@ -229,7 +229,7 @@ class Proposal:
 @dataclass(frozen=True)
 class Counts:
     """What a policy had to do about evaluations, for the summary of a run: gradients of
-    which single numbers were outliers and cut (`pgd.clipped`), those shortened as a
+    which single numbers were outliers and cut (`pgd.clip_gradient`), those shortened as a
     whole, and steps that were taken back (`rejected`).
     """
 
@@ -349,26 +349,29 @@ class Policy(ABC, Generic[State]):
 
 
 def draw_seed(generator: torch.Generator) -> int:
-    """Take one seed for `seeded` from the search's generator."""
+    """Draw a seed for `seeded` from the search's generator."""
     return int(torch.randint(2**31, (1,), generator=generator))
 
 
 def seeded(seed: int, number: int) -> torch.Generator:
-    """Return the generator for draw `number` of a policy: it depends on nothing
-    else.
+    """Return the generator for draw `number` of a policy.
+
+    It depends on the seed and the number only.
     """
     return torch.Generator().manual_seed(stream(seed, "policy", number))
 
 
 @contextmanager
-def use_one_thread() -> Iterator[None]:
-    """Let torch use one thread for a while: faster for small matrices, on a busy
-    machine many times so, and the last bits are the same whatever the number of
-    threads. Setting the number costs less than a microsecond.
+def limit_to_single_thread() -> Iterator[None]:
+    """Limit torch to a single thread inside the context.
+
+    This is faster for small matrices, on a busy machine many times so, and the last
+    bits do not depend on the number of threads. Setting it costs less than a
+    microsecond.
     """
-    before = torch.get_num_threads()
+    n_threads_before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(n_threads_before)

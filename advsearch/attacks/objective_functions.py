@@ -71,12 +71,12 @@ def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     configurations alike; between it and `margin` lies at most the logarithm of the
     number of classes.
     """
-    return _log_odds(logits, ~make_class_mask(logits, labels))
+    return _compute_log_odds(logits, ~make_class_mask(logits, labels))
 
 
 def targeted_log_odds(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     """log(p / (1 - p)) with p the total probability of T."""
-    return _log_odds(logits, make_class_mask(logits, target, "target"))
+    return _compute_log_odds(logits, make_class_mask(logits, target, "target"))
 
 
 def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
@@ -127,10 +127,12 @@ def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
         InputError: fewer than two wrong classes. Of two numbers only the order is left
             without scale and offset.
     """
-    top, spread = _sorted(logits, make_class_mask(logits, labels), "label")
+    top, spread = _sort_logits(logits, make_class_mask(logits, labels), "label")
     difference = margin(logits, images, labels)
-    wide = top[:, 0] - top[:, 2]
-    return difference / _safe(torch.where(difference > 0.0, _wider(top), wide), spread)
+    gap = top[:, 0] - top[:, 2]
+    return difference / _add_relief(
+        torch.where(difference > 0.0, _compute_wide_gap(top), gap), spread
+    )
 
 
 def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
@@ -140,13 +142,17 @@ def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     The targeted ratio of Croce and Hein 2020, section 4, whose numerator is z_t - z_y
     instead: that is over 0 also where a third class wins. Otherwise as `dlr`.
     """
-    top, spread = _sorted(logits, make_class_mask(logits, target, "target"), "target")
-    return targeted_margin(logits, images, target) / _safe(_wider(top), spread)
+    top, spread = _sort_logits(
+        logits, make_class_mask(logits, target, "target"), "target"
+    )
+    return targeted_margin(logits, images, target) / _add_relief(
+        _compute_wide_gap(top), spread
+    )
 
 
-def _log_odds(logits: Tensor, of: Tensor) -> Tensor:
-    inside = logits.masked_fill(~of, -math.inf).logsumexp(dim=1)
-    return inside - logits.masked_fill(of, -math.inf).logsumexp(dim=1)
+def _compute_log_odds(logits: Tensor, group: Tensor) -> Tensor:
+    group_logit = logits.masked_fill(~group, -math.inf).logsumexp(dim=1)
+    return group_logit - logits.masked_fill(group, -math.inf).logsumexp(dim=1)
 
 
 def _softplus(x: Tensor) -> Tensor:
@@ -158,7 +164,7 @@ def _softplus(x: Tensor) -> Tensor:
     )
 
 
-def _sorted(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, Tensor]:
+def _sort_logits(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, Tensor]:
     """Return the 4 largest logits (3, if there are no more), (N, 3 or 4), in falling
     order, the classes of a group taken for a single one with their largest, and the
     distance (N,) from the largest to the smallest of all. Refuses a label set that
@@ -179,12 +185,12 @@ def _sorted(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, Tensor
     return top, top[:, 0] - collapsed.amin(dim=1)
 
 
-def _wider(top: Tensor) -> Tensor:
+def _compute_wide_gap(top: Tensor) -> Tensor:
     """p_1 - (p_3 + p_4) / 2, or p_1 - (p_2 + p_3) / 2 where there are three."""
     return top[:, 0] - top[:, -2:].mean(dim=1)
 
 
-def _safe(denominator: Tensor, spread: Tensor) -> Tensor:
+def _add_relief(denominator: Tensor, spread: Tensor) -> Tensor:
     """Return a denominator that is over 0; 1 where all logits are the same."""
     return torch.where(
         spread > SAME, denominator + RELIEF * spread, torch.ones_like(spread)
@@ -238,14 +244,14 @@ def feature_distance(
         An objective (logits, images, labels) -> (N,), at least 0 but for h, that looks
         at the images only.
     """
-    reference = _reference(features, clean)
+    reference = _compute_reference(features, clean)
     length = torch.linalg.vector_norm(reference)
     scale = torch.where(length > 0.0, length, torch.ones_like(length))
-    away = _away(reference)
+    start_direction = _make_start_direction(reference)
 
     def objective(logits: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
-        moved = (features(images) - reference) / scale + away
-        squared = moved.square().sum(dim=1) + NEARBY**2
+        displacement = (features(images) - reference) / scale + start_direction
+        squared = displacement.square().sum(dim=1) + NEARBY**2
         distance: Tensor = squared.sqrt() - math.sqrt(2.0) * NEARBY
         return distance
 
@@ -271,26 +277,28 @@ def cosine_distance(
     Returns: An objective (features (N, F), images, labels) -> (N,), at least 0 but for
         `h`^2, that looks at the features only.
     """
-    reference = functional.normalize(_reference(features, clean), dim=0)
-    away = _away(reference)
+    reference = functional.normalize(_compute_reference(features, clean), dim=0)
+    start_direction = _make_start_direction(reference)
 
     def objective(output: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
-        moved = functional.normalize(output, dim=1) - reference.to(output)
-        distance: Tensor = moved.square().sum(dim=1) / 2.0 + moved @ away.to(output)
+        displacement = functional.normalize(output, dim=1) - reference.to(output)
+        distance: Tensor = displacement.square().sum(
+            dim=1
+        ) / 2.0 + displacement @ start_direction.to(output)
         return distance
 
     return objective
 
 
-def _away(reference: Tensor) -> Tensor:
+def _make_start_direction(reference: Tensor) -> Tensor:
     """Return a fixed direction (F,) of length `NEARBY`."""
-    away = torch.randn(reference.shape, generator=torch.Generator().manual_seed(0)).to(
-        reference
-    )
-    return away * (NEARBY / float(torch.linalg.vector_norm(away)))
+    direction = torch.randn(
+        reference.shape, generator=torch.Generator().manual_seed(0)
+    ).to(reference)
+    return direction * (NEARBY / float(torch.linalg.vector_norm(direction)))
 
 
-def _reference(features: ReadFeatures, clean: Tensor) -> Tensor:
+def _compute_reference(features: ReadFeatures, clean: Tensor) -> Tensor:
     """Return the mean features (F,) of the clean pictures."""
     with torch.no_grad():
         reference = features(clean if clean.dim() == 4 else clean[None])

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, final
@@ -73,7 +73,7 @@ class Objective(Protocol):
 
 
 def reject_inputs(name: str) -> Any:
-    """Refuse what is asked for where there is no configuration."""
+    """Raise InputError: without a configuration there are no further inputs."""
     raise InputError(
         f"objective: asks for `{name}`, and no configuration was given; "
         "pass `more`, which gives it"
@@ -82,8 +82,11 @@ def reject_inputs(name: str) -> Any:
 
 @dataclass(frozen=True)
 class ObjectiveSignature:
-    """Which arguments a function takes: (output, images, truth), or without `images`,
-    and what it asks for beside them, of `REQUESTABLE_INPUTS`.
+    """The arguments that a function takes.
+
+    Attributes:
+        images: whether it takes (output, images, truth), not (output, truth).
+        requested_inputs: names of `REQUESTABLE_INPUTS` that it takes besides.
     """
 
     images: bool = True
@@ -91,8 +94,13 @@ class ObjectiveSignature:
 
 
 def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
-    """Return which arguments a function takes. The names of its first two parameters
-    ask for nothing, nor does a third one in the place of the truth.
+    """Return which arguments a function takes.
+
+    The first two parameters request nothing, whatever their names are.
+
+    Raises:
+        InputError: a class, a function that takes images first, or one that does not
+            take these arguments.
     """
     if isinstance(function, type):
         raise InputError(
@@ -115,28 +123,31 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
             f"{by_position[0]!r}, but gets what the "
             "model says; write (output, images, truth)"
         )
-    asked = tuple(
+    requested_inputs = tuple(
         name
         for name in signature.parameters
         if name in REQUESTABLE_INPUTS and name not in by_position[:2]
     )
-    unnamed = [name for name in by_position if name not in asked]
-    images = len(unnamed) < 2 or any(
+    positional_names = [name for name in by_position if name not in requested_inputs]
+    takes_images = len(positional_names) < 2 or any(
         parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters
     )
-    images = images or (
-        unnamed[1] not in TRUTH_PARAMETERS
-        and (len(unnamed) > 2 or unnamed[1] in (*IMAGE_PARAMETERS, *REQUESTABLE_INPUTS))
-    )
+    if not takes_images and positional_names[1] not in TRUTH_PARAMETERS:
+        has_third = len(positional_names) > 2
+        takes_images = has_third or positional_names[1] in (
+            *IMAGE_PARAMETERS,
+            *REQUESTABLE_INPUTS,
+        )
+    n_positional = 3 if takes_images else 2
     try:
-        signature.bind(*([None] * (3 if images else 2)), **dict.fromkeys(asked))
+        signature.bind(*([None] * n_positional), **dict.fromkeys(requested_inputs))
     except TypeError as error:
         raise InputError(
             f"objective {get_name(function)!r}: expected a function that takes (output, "
             "images, truth) or (output, "
             f"labels), and beside them any of {', '.join(REQUESTABLE_INPUTS)} by name: {error}"
         ) from None
-    return ObjectiveSignature(images, asked)
+    return ObjectiveSignature(takes_images, requested_inputs)
 
 
 def wrap_objective(function: Callable[..., Tensor]) -> Objective:
@@ -149,85 +160,104 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
     values pass too: a search has a rule for them.
     """
     name = get_name(function)
-    form = read_signature(function)
+    signature = read_signature(function)
 
     def objective(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
-        asked = {asks: more(asks) for asks in form.requested_inputs}
+        inputs = {
+            input_name: more(input_name) for input_name in signature.requested_inputs
+        }
         count = images.shape[0]
-        arguments = (output, images, truth_to_labels(truth, output, count))
-        handed = copied(arguments if form.images else arguments[::2])
-        handed_by_name = copied(asked)
+        labels = truth_to_labels(truth, output, count)
+        arguments = (output, images, labels) if signature.images else (output, labels)
+        argument_copies = copied(arguments)
+        input_copies = copied(inputs)
         try:
-            values = function(*handed, **handed_by_name)
+            result = function(*argument_copies, **input_copies)
         except TypeError as error:
-            if not (isinstance(arguments[2], tuple) and "not tuple" in str(error)):
+            if not (isinstance(labels, tuple) and "not tuple" in str(error)):
                 raise
             raise InputError(
                 f"objective {name!r}: expected one right label for a loss of torch, "
                 f"got {len(truth)} (indices "
                 f"{truth}); use those of advsearch.losses, or name one with `label`"
             ) from error
-        if isinstance(values, Tensor) and values.ndim == 0 and count > 1:
-            parts = [
-                (slice(k, k + 1), partial(_of_one, asked, k)) for k in range(count)
-            ]
-            values = torch.cat(
-                [
-                    objective(output[part], images[part], truth, more)
-                    for part, more in parts
-                ]
-            )
-        values = _values(name, values, count)
+        if isinstance(result, Tensor) and result.ndim == 0 and count > 1:
+            result = _evaluate_each_image(objective, output, images, truth, inputs)
+        values = _check_values(name, result, count)
         if values.requires_grad and any(
-            tensor._version for tensor in _tensors((handed, handed_by_name))
+            tensor._version for tensor in _list_tensors((argument_copies, input_copies))
         ):
-            read = [
-                tensor for tensor in _tensors((output, asked)) if tensor.requires_grad
+            sources = [
+                tensor
+                for tensor in _list_tensors((output, inputs))
+                if tensor.requires_grad
             ]
-            _check_in_place(name, values, read or [images])
-        seen = [
-            value
-            for value in (images, output, *asked.values())
-            if isinstance(value, Tensor)
-        ]
-        if (
-            torch.is_grad_enabled()
-            and any(value.requires_grad for value in seen)
-            and not values.requires_grad
-        ):
-            raise InputError(
-                f"objective {name!r}: the result does not depend on the output or the "
-                "images differentiably; "
-                "remove .detach(), torch.no_grad() or argmax, or choose a policy "
-                "without gradients (random)"
-            )
+            _check_differentiable(name, values, sources or [images])
+        _check_keeps_gradient(name, values, (images, output, *inputs.values()))
         return values
 
     return objective
 
 
-def _tensors(value: Any) -> list[Tensor]:
-    """Those that an objective was handed, in tuples, lists and mappings."""
+def _evaluate_each_image(
+    objective: Objective,
+    output: Any,
+    images: Tensor,
+    truth: Any,
+    inputs: Mapping[str, Any],
+) -> Tensor:
+    """Return the values (N,) of an objective that is called with an image at a time.
+
+    Args:
+        objective: returns a scalar.
+        output: of the model for N images.
+        images: (N, H, W, 3).
+        truth: equal for all images.
+        inputs: what the objective requests by name, for N images.
+    """
+    values = []
+    for index in range(images.shape[0]):
+        image_slice = slice(index, index + 1)
+        read_input = partial(_select_input, inputs, index)
+        values.append(
+            objective(output[image_slice], images[image_slice], truth, read_input)
+        )
+    return torch.cat(values)
+
+
+def _check_keeps_gradient(name: str, values: Tensor, sources: tuple[Any, ...]) -> None:
+    """Raise InputError if a function lost the gradient by its sources, such as images."""
+    if values.requires_grad or not torch.is_grad_enabled():
+        return
+    if any(isinstance(source, Tensor) and source.requires_grad for source in sources):
+        raise InputError(
+            f"objective {name!r}: the result does not depend on the output or the "
+            "images differentiably; "
+            "remove .detach(), torch.no_grad() or argmax, or choose a policy "
+            "without gradients (random)"
+        )
+
+
+def _list_tensors(value: Any) -> list[Tensor]:
+    """Return all tensors in nested tuples, lists and mappings."""
     if isinstance(value, Tensor):
         return [value]
-    parts = (
-        value.values()
-        if isinstance(value, dict)
-        else value
-        if isinstance(value, (list, tuple))
-        else ()
-    )
-    return [tensor for part in parts for tensor in _tensors(part)]
+    elements: Iterable[Any] = ()
+    if isinstance(value, dict):
+        elements = value.values()
+    elif isinstance(value, (list, tuple)):
+        elements = value
+    return [tensor for element in elements for tensor in _list_tensors(element)]
 
 
-def _check_in_place(name: str, values: Tensor, read: Sequence[Tensor]) -> None:
-    """Refuse what a function has written into, where torch can't differentiate it any
-    more.
+def _check_differentiable(name: str, values: Tensor, sources: Sequence[Tensor]) -> None:
+    """Raise InputError if writing in place keeps torch from differentiating values (N,)
+    by their sources.
     """
     try:
-        torch.autograd.grad(values.sum(), read, retain_graph=True, allow_unused=True)
+        torch.autograd.grad(values.sum(), sources, retain_graph=True, allow_unused=True)
     except RuntimeError as error:
         if "inplace" not in str(error):
             raise
@@ -241,11 +271,16 @@ def _check_in_place(name: str, values: Tensor, read: Sequence[Tensor]) -> None:
 
 
 def get_name(function: Callable[..., Any]) -> str:
-    """Return what a function is called in messages."""
+    """Return the name of a function for messages."""
     return getattr(function, "__name__", type(function).__name__)
 
 
-def _values(name: str, values: Any, count: int) -> Tensor:
+def _check_values(name: str, values: Any, count: int) -> Tensor:
+    """Return what a function returned as one value per image, (count,).
+
+    Raises:
+        InputError: it is no floating-point tensor of that shape.
+    """
     if not isinstance(values, Tensor):
         raise InputError(
             f"objective {name!r}: expected a torch tensor of shape ({count},), got "
@@ -259,16 +294,16 @@ def _values(name: str, values: Any, count: int) -> Tensor:
             "a count or a comparison has "
             "no gradient"
         )
-    by_picture: Tensor = (
-        values.reshape(1) if values.ndim == 0 and count == 1 else values
-    )
-    if by_picture.shape != (count,):
+    value_per_image: Tensor = values
+    if values.ndim == 0 and count == 1:
+        value_per_image = values.reshape(1)
+    if value_per_image.shape != (count,):
         raise InputError(
             f"objective {name!r}: expected one value per image, shape ({count},), got "
-            f"{tuple(by_picture.shape)}; "
+            f"{tuple(value_per_image.shape)}; "
             "reduce over everything but the first axis"
         )
-    return by_picture
+    return value_per_image
 
 
 def truth_to_labels(truth: Any, output: Any, count: int) -> Any:
@@ -285,15 +320,13 @@ def truth_to_labels(truth: Any, output: Any, count: int) -> Any:
     return truth
 
 
-def _of_one(asked: Mapping[str, Any], picture: int, name: str) -> Any:
-    """Return what was asked for of several pictures for one of them."""
-    value = asked[name]
-    part = slice(picture, picture + 1)
-    return (
-        value[part]
-        if isinstance(value, Tensor)
-        else {key: values[part] for key, values in value.items()}
-    )
+def _select_input(inputs: Mapping[str, Any], index: int, name: str) -> Any:
+    """Return the input of that name for a single image of several, by its index."""
+    value = inputs[name]
+    image_slice = slice(index, index + 1)
+    if isinstance(value, Tensor):
+        return value[image_slice]
+    return {key: values[image_slice] for key, values in value.items()}
 
 
 @final
@@ -346,7 +379,7 @@ class ObjectiveKind:
         return function
 
 
-def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
+def _ignore_inputs(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
     def plain(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
@@ -355,7 +388,7 @@ def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
     return plain
 
 
-def _handed(objective: Objective) -> Objective:
+def _pass_copies(objective: Objective) -> Objective:
     """The objective of another package, called with copies."""
 
     def handed(
@@ -368,14 +401,14 @@ def _handed(objective: Objective) -> Objective:
     return handed
 
 
-def _score_of(task: Task) -> Objective:
-    return _plain(lambda output, images, truth: task.score(output, truth))
+def _make_score_objective(task: Task) -> Objective:
+    return _ignore_inputs(lambda output, images, truth: task.score(output, truth))
 
 
 _DEPTH_GOALS: Mapping[str, str] = (
     load_attribute("advsearch.tasks.depth:GOALS") if "depth" in TASKS.built_ins else {}
 )
-_OWN = {
+_BUILT_IN_KINDS = {
     kind.name: kind
     for kind in (
         *(
@@ -430,7 +463,7 @@ _OWN = {
             "classification the margin loss",
             "that of the task",
             task=None,
-            of_task=_score_of,
+            of_task=_make_score_objective,
         ),
         *(
             ObjectiveKind(
@@ -438,7 +471,7 @@ _OWN = {
                 f"success: {summary}",
                 "log-odds",
                 task=Detection.name,
-                of_task=_score_of,
+                of_task=_make_score_objective,
             )
             for name, summary in GOALS.items()
         ),
@@ -448,7 +481,7 @@ _OWN = {
             "put together by `ensemble`",
             "those of the tasks",
             task=EnsembleTask.name,
-            of_task=_score_of,
+            of_task=_make_score_objective,
         ),
         *(
             ObjectiveKind(
@@ -456,7 +489,7 @@ _OWN = {
                 f"success: {summary}",
                 "logarithm of a factor",
                 task="depth",
-                of_task=_score_of,
+                of_task=_make_score_objective,
             )
             for name, summary in _DEPTH_GOALS.items()
         ),
@@ -466,7 +499,7 @@ _OWN = {
             "over the object's pixels",
             "logits (log-odds)",
             task="segmentation",
-            of_task=lambda task: _plain(
+            of_task=lambda task: _ignore_inputs(
                 lambda output, images, truth: task.pixel_margin(output, truth)
             ),
         ),
@@ -476,14 +509,14 @@ _OWN = {
 
 OBJECTIVE_KINDS: Registry[ObjectiveKind] = Registry(
     "advsearch.objectives",
-    _OWN,
+    _BUILT_IN_KINDS,
     "an ObjectiveKind whose name is that of the entry point",
     lambda name, entry: isinstance(entry, ObjectiveKind) and entry.name == name,
 )
 """Every objective that has a name."""
 
 OBJECTIVES: dict[str, Callable[..., Tensor]] = {
-    name: kind.plain for name, kind in _OWN.items() if kind.plain is not None
+    name: kind.plain for name, kind in _BUILT_IN_KINDS.items() if kind.plain is not None
 }
 """Those of our own that need nothing but logits, in their plain form."""
 
@@ -524,13 +557,13 @@ def get_objective(
     task = task or Classification()
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
-    kind = _kind_of(objective)
+    kind = _find_kind(objective)
     by_task = False
-    ours = kind is not None and _OWN.get(kind.name) is kind
+    ours = kind is not None and _BUILT_IN_KINDS.get(kind.name) is kind
     if kind is None:
         function = wrap_objective(objective)  # type: ignore[arg-type]
     elif kind.of_task is not None:
-        return kind.of_task(task) if ours else _handed(kind.of_task(task))
+        return kind.of_task(task) if ours else _pass_copies(kind.of_task(task))
     elif kind.of_features is not None:
         if features is None or clean is None:
             raise InputError(
@@ -539,11 +572,11 @@ def get_objective(
                 "get_objective(name, "
                 "features=advsearch.models.features.features_of(model), clean=picture)"
             )
-        function = _plain(kind.of_features(features, clean))
-        function = function if ours else _handed(function)
+        function = _ignore_inputs(kind.of_features(features, clean))
+        function = function if ours else _pass_copies(function)
     else:
         form = kind.form(targeted=targeted)
-        function = _plain(form) if ours else wrap_objective(form)
+        function = _ignore_inputs(form) if ours else wrap_objective(form)
         compares_features = isinstance(task, Classification) and not task.reads_logits
         by_task = compares_features or (
             isinstance(task, ClassTask) and bool(task.nothing_classes)
@@ -627,7 +660,7 @@ def check_objective(
             "objective: expected a name or a function (output, images, "
             f"truth), got {objective!r}"
         )
-    kind = _kind_of(objective)
+    kind = _find_kind(objective)
     if kind is None:
         read_signature(objective)  # type: ignore[arg-type]
         return
@@ -651,12 +684,12 @@ def list_requested_inputs(objective: str | Callable[..., Tensor]) -> tuple[str, 
     """Return what an objective, checked already, asks for beside output, images and
     truth.
     """
-    kind = _kind_of(objective)
+    kind = _find_kind(objective)
     function = objective if kind is None else kind.plain
     return read_signature(function).requested_inputs if callable(function) else ()
 
 
-def _kind_of(objective: object) -> ObjectiveKind | None:
+def _find_kind(objective: object) -> ObjectiveKind | None:
     """Return the kind of a name, or of a function that has one; None for the user's
     own.
     """

@@ -362,7 +362,8 @@ def _explore(
     """
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     name = policy.name
-    policy = log.policy = wrap_choices(policy, log.domain)
+    policy = wrap_choices(policy, log.domain)
+    log.policy = policy
     state = policy.start(log.domain, generator, steps)
     n_non_finite = 0
     max_batch = max_batch_size(log.domain.dim)
@@ -376,15 +377,9 @@ def _explore(
                 f"policy {name!r} proposed {len(proposals)} "
                 f"configurations; expected at most {max_proposals}"
             )
-        batch = list[Proposal]()
-        renders_left = steps - log.renders
         for proposal in proposals:
             _check_inside(proposal, log.domain, name)
-            if renders_left > 0:
-                # a policy may write into its own later
-                proposal_copy = replace(proposal, u=proposal.u.clone())
-                batch.append(proposal_copy.limit_cost(log.domain, renders_left))
-                renders_left -= batch[-1].max_cost(log.domain)
+        batch = _limit_batch(proposals, log.domain, steps - log.renders)
         log.state = state
         log.evaluated_batch = []
         is_out_of_time = False
@@ -402,6 +397,21 @@ def _explore(
         state = log.state = policy.update(state, log.evaluated_batch)
         log.evaluated_batch = []
     return Ending.BUDGET_SPENT
+
+
+def _limit_batch(
+    proposals: Sequence[Proposal], domain: Domain, renders_left: int
+) -> list[Proposal]:
+    """Return copies of the first proposals, as many and as costly as the renders allow."""
+    batch = list[Proposal]()
+    for proposal in proposals:
+        if renders_left <= 0:
+            break
+        # A policy may write into its tensor later.
+        proposal_copy = replace(proposal, u=proposal.u.clone())
+        batch.append(proposal_copy.limit_cost(domain, renders_left))
+        renders_left -= batch[-1].max_cost(domain)
+    return batch
 
 
 def _rank(log: _Log, first: int, repeats: int, close: int) -> None:

@@ -80,12 +80,12 @@ def make_margin_function(
     rows of all sample counts are numbered together, and the first `n_images` pictures of
     each are wanted.
     """
-    n_made = Counter[int]()
+    n_rendered = Counter[int]()
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
-        numbers = range(n_made[spp], n_made[spp] + len(seeds))
-        rows = enumerate(zip(seeds, numbers, strict=True), n_made.total())
-        n_made[spp] += len(seeds)
+        numbers = range(n_rendered[spp], n_rendered[spp] + len(seeds))
+        rows = enumerate(zip(seeds, numbers, strict=True), n_rendered.total())
+        n_rendered[spp] += len(seeds)
         queries = [
             Query(
                 u,
@@ -190,28 +190,49 @@ def choose_spp(
     reached = 1
     looks = list_look_sizes(trials)
     for name, render in margins.items():
-        values = _climbed(render, seed, ladder, looks, trials)
+        margins_of_rungs = _climb_ladder(render, seed, ladder, looks, trials)
         below: list[float] = []
-        for spp, margins_here in zip(ladder, values, strict=False):
-            half_width = (
-                _quantile(len(margins_here), len(looks))
-                * _deviation(margins_here)
-                / math.sqrt(len(margins_here))
-            )
-            drift = fmean(margins_here) - fmean(below) if below else math.nan
-            settled = bool(below) and _settled(margins_here, below, len(looks), trials)
-            table.append(
-                Rung(name, spp, fmean(margins_here), half_width, drift, settled)
-            )
-            below = margins_here
-        renders = renders + sum(map(len, values))
-        reached = max(reached, len(values) - 1)
+        for spp, at_rung in zip(ladder, margins_of_rungs, strict=False):
+            table.append(_summarize_rung(name, spp, at_rung, below, len(looks), trials))
+            below = at_rung
+        renders = renders + sum(map(len, margins_of_rungs))
+        reached = max(reached, len(margins_of_rungs) - 1)
         if not table[-1].is_settled:
             return SampleCount(ladder[-1], False, tuple(table), renders)
     return SampleCount(ladder[reached], True, tuple(table), renders)
 
 
-def _climbed(
+def _summarize_rung(
+    name: str,
+    spp: int,
+    at_rung: Sequence[float],
+    below: Sequence[float],
+    looks: int,
+    trials: int,
+) -> Rung:
+    """Return the row of a configuration at one sample count.
+
+    Args:
+        name: of the configuration.
+        spp: samples per pixel.
+        at_rung: margins of the rung.
+        below: margins of the rung below; empty at the first.
+        looks: how often one looks.
+        trials: that will follow; 0 where other trials follow.
+    """
+    mean = fmean(at_rung)
+    half_width = (
+        _compute_quantile(len(at_rung), looks)
+        * _compute_deviation(at_rung)
+        / math.sqrt(len(at_rung))
+    )
+    if not below:
+        return Rung(name, spp, mean, half_width, math.nan, False)
+    is_settled = _is_settled(at_rung, below, looks, trials)
+    return Rung(name, spp, mean, half_width, mean - fmean(below), is_settled)
+
+
+def _climb_ladder(
     margins: MarginsOf,
     seed: int,
     ladder: Sequence[int],
@@ -237,12 +258,12 @@ def _climbed(
                 for number in range(len(values[rung]), count)
             ]:
                 values[rung] += margins(ladder[rung], new)
-        if _settled(values[level], values[level - 1], len(looks), trials):
+        if _is_settled(values[level], values[level - 1], len(looks), trials):
             break
     return [measured for measured in values if measured]
 
 
-def _settled(
+def _is_settled(
     at_rung: Sequence[float], below: Sequence[float], looks: int, trials: int
 ) -> bool:
     """Return whether more samples would not change the sign of the margin.
@@ -250,26 +271,26 @@ def _settled(
     See `choose_spp` for the three conditions.
 
     Args:
-        here: margins of a rung.
+        at_rung: margins of a rung.
         below: margins of the rung below.
         looks: how often one looks, which share the 5 %.
         trials: that will follow; 0 where other trials follow.
     """
     mean = fmean(at_rung)
     count = min(len(at_rung), len(below))
-    deviation = _deviation(at_rung)
+    deviation = _compute_deviation(at_rung)
     # the mean if the rest of the noise changed it as much as the step from below did
     extrapolated = 2.0 * mean - fmean(below)
-    extrapolated_error = math.hypot(2.0 * deviation, _deviation(below)) / math.sqrt(
-        count
-    )
+    extrapolated_error = math.hypot(
+        2.0 * deviation, _compute_deviation(below)
+    ) / math.sqrt(count)
     sign = math.copysign(1.0, mean)
-    quantile = _quantile(count, looks)
+    quantile = _compute_quantile(count, looks)
     error = deviation / math.sqrt(count) if count == trials else deviation
     is_mean_sure = sign * mean > quantile * error
     is_extrapolated_sure = sign * extrapolated > quantile * extrapolated_error
-    has_one_sign = all(sign * value > 0.0 for value in at_rung)
-    return is_mean_sure and is_extrapolated_sure and has_one_sign
+    is_sign_constant = all(sign * value > 0.0 for value in at_rung)
+    return is_mean_sure and is_extrapolated_sure and is_sign_constant
 
 
 def _may_settle(
@@ -294,16 +315,18 @@ def _may_settle(
     last_values = values[last_rung]
     mean = fmean(last_values)
     drift = abs(mean - fmean(values[rendered_rungs[-2]]))
-    standard_error = _deviation(last_values) / math.sqrt(len(last_values))
+    standard_error = _compute_deviation(last_values) / math.sqrt(len(last_values))
     max_mean = abs(mean) + drift + standard_error
 
     def estimate_deviation(rung: int) -> float:
         if values[rung]:
-            return _deviation(values[rung])
-        return _deviation(last_values) * math.sqrt(ladder[last_rung] / ladder[rung])
+            return _compute_deviation(values[rung])
+        return _compute_deviation(last_values) * math.sqrt(
+            ladder[last_rung] / ladder[rung]
+        )
 
     error = math.hypot(2.0 * estimate_deviation(level), estimate_deviation(level - 1))
-    return error * _quantile(count, looks) / math.sqrt(count) <= max_mean
+    return error * _compute_quantile(count, looks) / math.sqrt(count) <= max_mean
 
 
 def list_look_sizes(trials: int = 0) -> tuple[int, ...]:
@@ -328,14 +351,14 @@ def most_samples(
     )
 
 
-def _deviation(values: Sequence[float]) -> float:
+def _compute_deviation(values: Sequence[float]) -> float:
     """Return the standard deviation of a sample."""
     mean = fmean(values)
     squares = math.fsum((value - mean) ** 2 for value in values)
     return math.sqrt(squares / (len(values) - 1))
 
 
-def _quantile(count: int, looks: int) -> float:
+def _compute_quantile(count: int, looks: int) -> float:
     """Of Student's t, for one end of the interval of a mean of so many values at one of
     the looks.
     """
@@ -381,11 +404,11 @@ def choose_rate_spp(
 
     Each is rendered under the same `N_CONDITIONS` at a rung and at the one below. It has
     settled where the mean change of the margin, taken once more and at either end of
-    its 95 % interval (Student's t), would carry at most `MAX_MOVED_FRACTION` of the conditions over
-    zero (`estimate_moved_fraction`). The error that is left falls with the sample count, so it is smaller
-    than the change that led here (`benchmarks/verdicts.py` has how far the rate is off
-    then). No render of it is a trial. Arguments are as of `choose_spp`; conditions are
-    drawn by the seeds.
+    its 95 % interval (Student's t), would carry at most `MAX_MOVED_FRACTION` of the
+    conditions over zero (`estimate_moved_fraction`). The error that is left falls with
+    the sample count, so it is smaller than the change that led here
+    (`benchmarks/verdicts.py` has how far the rate is off then). No render of it is a
+    trial. Arguments are as of `choose_spp`; conditions are sampled by the seeds.
     """
     if len(ladder) == 1:
         return SampleCount(ladder[0], False, (), 0)
@@ -432,20 +455,20 @@ def choose_rate_spp(
     return SampleCount(ladder[reached], True, tuple(table), N_CONDITIONS * len(table))
 
 
-def estimate_moved_fraction(here: FloatArray, below: FloatArray) -> float:
+def estimate_moved_fraction(at_rung: FloatArray, below: FloatArray) -> float:
     """Return the fraction of conditions that more samples may carry over zero.
 
     The mean change of the margins (n,) from one rung to the next is taken once more.
     The margins are smoothed by normal kernels of Silverman's width. NaN where a margin
     is no number.
     """
-    change = here - below
-    width = 0.9 * here.std(ddof=1) * len(here) ** -0.2
+    change = at_rung - below
+    width = 0.9 * at_rung.std(ddof=1) * len(at_rung) ** -0.2
     if not np.isfinite(change).all():
         return math.nan
-    quantile = stdtrit(len(here) - 1, 0.5 + CONFIDENCE / 2.0)
-    half_width = quantile * change.std(ddof=1) / math.sqrt(len(here))
+    quantile = stdtrit(len(at_rung) - 1, 0.5 + CONFIDENCE / 2.0)
+    half_width = quantile * change.std(ddof=1) / math.sqrt(len(at_rung))
     mean_change = change.mean()
     shifts = np.array([0.0, mean_change - half_width, mean_change + half_width])
-    fractions = ndtr((here + shifts[:, None]) / max(width, 1e-12)).mean(axis=1)
+    fractions = ndtr((at_rung + shifts[:, None]) / max(width, 1e-12)).mean(axis=1)
     return float(np.abs(fractions[1:] - fractions[0]).max())

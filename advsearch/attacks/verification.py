@@ -6,7 +6,7 @@ clean configuration. A verdict's rule stands here only.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
@@ -368,14 +368,7 @@ def verify(
     run_clean = partial(run, domain.start, kind=control_kind)
     until = has_failed if curtailed or has_several_looks else None
     for look in looks:
-        # Under conditions, clean trials that are wrong do not count: more are run.
-        count = look
-        clean_trials += run_clean(trials=count, n_done=len(clean_trials))
-        n_missing = look - rule.count_valid(clean_trials[:count])
-        while n_missing > 0 and count < looks[-1]:
-            count = min(count + n_missing, looks[-1])
-            clean_trials += run_clean(trials=count, n_done=len(clean_trials))
-            n_missing = look - rule.count_valid(clean_trials[:count])
+        count = _extend_clean_trials(clean_trials, run_clean, rule, look, looks[-1])
         done += run(
             u,
             trials=count,
@@ -385,15 +378,12 @@ def verify(
             is_decided=until,
         )
         is_early = count < looks[-1]
-        n_needed = rule.count_needed(
-            rule.count_valid(clean_trials[:count]), early=is_early
+        is_success = _is_found(
+            rule, done, clean_trials, count, spp=spp, is_early=is_early
         )
-        n_successes = _list_outcomes(rule, done, clean_trials).count(True)
-        is_clean_wrong = rule.is_already_wrong(count_right(clean_trials[:count], spp))
-        is_success = n_successes >= n_needed and not is_clean_wrong
         if len(done) < count or has_failed(()) or is_success or not is_early:
             break
-    was_asked_for = not has_several_looks and len(done) == looks[0]
+    is_complete = not has_several_looks and len(done) == looks[0]
     return _summarize_trials(
         rule,
         claim,
@@ -405,10 +395,49 @@ def verify(
             OVER_CONFIDENCE if rule.is_conditional and has_several_looks else CONFIDENCE
         ),
         renders=len(done) + len(clean_trials) - len(clean),
-        stopped="asked for" if was_asked_for else "decided",
+        stopped="asked for" if is_complete else "decided",
         is_early=is_success and is_early,
         begin=first_index,
     )
+
+
+def _extend_clean_trials(
+    clean_trials: list[Judgement],
+    run_clean: Callable[..., Iterable[Judgement]],
+    rule: Rule,
+    look: int,
+    max_trials: int,
+) -> int:
+    """Run clean trials until `look` of them count; return how many there are.
+
+    Under conditions, clean trials that are wrong do not count, so that more are run, up
+    to `max_trials`.
+    """
+    count = look
+    clean_trials += run_clean(trials=count, n_done=len(clean_trials))
+    n_missing = look - rule.count_valid(clean_trials[:count])
+    while n_missing > 0 and count < max_trials:
+        count = min(count + n_missing, max_trials)
+        clean_trials += run_clean(trials=count, n_done=len(clean_trials))
+        n_missing = look - rule.count_valid(clean_trials[:count])
+    return count
+
+
+def _is_found(
+    rule: Rule,
+    trials: Sequence[Judgement],
+    clean_trials: Sequence[Judgement],
+    count: int,
+    *,
+    spp: int,
+    is_early: bool,
+) -> bool:
+    """Return whether enough trials succeed, and the clean configuration is not wrong."""
+    clean_looked_at = clean_trials[:count]
+    n_needed = rule.count_needed(rule.count_valid(clean_looked_at), early=is_early)
+    n_successes = _list_outcomes(rule, trials, clean_trials).count(True)
+    is_clean_wrong = rule.is_already_wrong(count_right(clean_looked_at, spp))
+    return n_successes >= n_needed and not is_clean_wrong
 
 
 def _list_outcomes(

@@ -66,6 +66,22 @@ def sample_condition(domain: Domain, index: int, seed: int) -> Tensor:
     return to_domain(domain, torch.from_numpy(point).float())
 
 
+def _compare_means(
+    bank_objectives: Sequence[float], unseen_objectives: Sequence[float]
+) -> tuple[float, float]:
+    """Return the difference of the mean objectives, and its standard error.
+
+    It is over 0 where conditions that are not in the bank are better for the model.
+    """
+    bank_mean = statistics.fmean(bank_objectives)
+    gap = bank_mean - statistics.fmean(unseen_objectives)
+    variances = (
+        statistics.pvariance(objectives) / len(objectives)
+        for objectives in (bank_objectives, unseen_objectives)
+    )
+    return gap, math.sqrt(sum(variances))
+
+
 @dataclass(frozen=True, eq=False)
 class Condition:
     """A condition of the bank, and its matrix.
@@ -310,16 +326,9 @@ class Bank(PredictedSearch):
                 partial(self._predict_images, conditions), full_configurations, u, False
             )
             bank_objectives = [evaluation.objective for evaluation, _ in evaluated]
-            bank_mean = statistics.fmean(bank_objectives)
-            gap = bank_mean - statistics.fmean(unseen_objectives)
+            gap, standard_error = _compare_means(bank_objectives, unseen_objectives)
             self.gaps.append(gap)
             self.n_traced += N_COMPARED
-            standard_error = math.sqrt(
-                sum(
-                    statistics.pvariance(objectives) / len(objectives)
-                    for objectives in (bank_objectives, unseen_objectives)
-                )
-            )
 
         def compare_view(number: int) -> ComparedView:
             position = number % len(conditions)

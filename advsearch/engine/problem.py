@@ -91,6 +91,11 @@ def _cache(cached: dict[bytes, Any], key: bytes, value: Any) -> None:
 VARIES_BY_CHANCE = "forced: it varies by chance, so nobody asks for its derivative"
 
 
+def _split_batch(outputs: Output, count: int) -> list[Output]:
+    """Return the model's output of each of `count` images, as batches of one image."""
+    return [outputs[index : index + 1] for index in range(count)]
+
+
 @dataclass
 class Problem:
     """Evaluates configurations of a scene by renderer, model, task and objective.
@@ -633,7 +638,7 @@ class Problem:
                     value = loss(renderer(full_u, seed=seed, spp=spp))
         image, output = calls[0]
         (judgement,) = self._judge_outputs(output, image[None], [truth], [full_u])
-        evaluation = Evaluation(
+        return Evaluation(
             float(value),
             gradient,
             judgement.success,
@@ -641,8 +646,7 @@ class Problem:
             cost=max(1, renderer.renders - renders_before) * query.samples,
             judgement=judgement,
             picture=round_to_8_bit(image) if query.with_image else None,
-        )
-        return evaluation, output
+        ), output
 
     def _limit_search_depth(self, renderer: Renderer) -> AbstractContextManager[None]:
         """Shorten the light paths of a renderer to those of a search in a block."""
@@ -674,41 +678,49 @@ class Problem:
         with torch.set_grad_enabled(bool(gradient)):
             images = render(variable_u)
             outputs = self.model(images)
-            outputs_of_images = [
-                outputs[index : index + 1] for index in range(len(full_configurations))
-            ]
+            outputs_of_images = _split_batch(outputs, len(full_configurations))
             truths = [self.find_truth(full_u) for full_u in full_configurations]
             variable_configurations = [
                 torch.cat([variable_u, full_u[len(variable_u) :]])
                 for full_u in full_configurations
             ]
             if self.task.varies:
-                objectives = [
-                    self._compute_objective(
-                        output, image, truth, self.make_objective_inputs(full_u)
-                    )
-                    for output, image, truth, full_u in zip(
-                        outputs_of_images,
-                        images.split(1),
-                        truths,
-                        variable_configurations,
-                        strict=True,
-                    )
-                ]
-                values = torch.cat(objectives)
+                values = self._compute_objective_of_each(
+                    outputs_of_images, images, truths, variable_configurations
+                )
             else:
-                inputs = self.make_objective_inputs(*variable_configurations)
-                values = self._compute_objective(outputs, images, truths[0], inputs)
+                values = self._compute_objective(
+                    outputs,
+                    images,
+                    truths[0],
+                    self.make_objective_inputs(*variable_configurations),
+                )
             derivative = torch.zeros_like(u) if gradient else None
             if values.requires_grad:
                 weighted_sum = (values * compute_condition_weights(values)).sum()
                 (derivative,) = torch.autograd.grad(weighted_sum, variable_u)
-        judged = self._judge_outputs(outputs, images, truths, full_configurations)
+        judgements = self._judge_outputs(outputs, images, truths, full_configurations)
         evaluations = [
             Evaluation(float(value), None, judgement.success, judgement=judgement)
-            for value, judgement in zip(values.detach(), judged, strict=True)
+            for value, judgement in zip(values.detach(), judgements, strict=True)
         ]
         return list(zip(evaluations, outputs_of_images, strict=True)), derivative
+
+    def _compute_objective_of_each(
+        self,
+        outputs: Sequence[Output],
+        images: Tensor,
+        truths: Sequence[Any],
+        full_configurations: Sequence[Tensor],
+    ) -> Tensor:
+        """Return the objectives (N,) of images (N, H, W, 3) with a truth of each."""
+        objectives = []
+        for output, image, truth, full_u in zip(
+            outputs, images.split(1), truths, full_configurations, strict=True
+        ):
+            inputs = self.make_objective_inputs(full_u)
+            objectives.append(self._compute_objective(output, image, truth, inputs))
+        return torch.cat(objectives)
 
     def evaluate_conditions(
         self,

@@ -371,21 +371,22 @@ def render(
         progress.advance(1)
     # Formation and space are the same for all views, exposure included.
     space = rendered.space
-    warnings = (
-        *space.list_notes(description),
-        *describe_adjusted_defaults(space.adjusted_defaults),
-        *truth_warnings,
-        *remarks,
-    )
-    environment_spec = space.environment or description.environment_spec
     return Rendering(
-        replace(description, environment_spec=environment_spec),
+        replace(
+            description,
+            environment_spec=space.environment or description.environment_spec,
+        ),
         model.name,
         unbound_task.name,
         rendered.formation,
         spp,
         tuple(views),
-        warnings,
+        (
+            *space.list_notes(description),
+            *describe_adjusted_defaults(space.adjusted_defaults),
+            *truth_warnings,
+            *remarks,
+        ),
     )
 
 
@@ -426,11 +427,9 @@ def _render_view(
         truth = None
         truth_error = ""
         if task.varies:
-            facts = _make_view_facts(description, space, renderer, u, settings)
-            try:
-                truth = task.truth(facts)
-            except InputError as error:
-                truth_error = str(error)
+            truth, truth_error = _find_truth(
+                task, _make_view_facts(description, space, renderer, u, settings)
+            )
         task = task.after_calibration(output, truth)
         predictions = task.predictions(output, MAX_PREDICTIONS)[0]
         marks = () if truth is None else tuple(task.marks(output, truth)[0])
@@ -446,6 +445,14 @@ def _render_view(
         things=find_visible_things(renderer, u),
     )
     return _RenderedView(view, task, space, formation, truth_error)
+
+
+def _find_truth(task: Task, facts: Facts) -> tuple[Any, str]:
+    """Return what is true by the facts, or None and why the task cannot tell."""
+    try:
+        return task.truth(facts), ""
+    except InputError as error:
+        return None, str(error)
 
 
 def _choose_configuration(space: Space, at: Tensor | None) -> Tensor:

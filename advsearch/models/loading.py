@@ -120,16 +120,15 @@ def load_model(
     Warns:
         ModelWarning: see `advsearch.models.probe.probe`.
     """
-    all_options = {
-        "input_size": input_size,
-        "mean": mean,
-        "std": std,
-        "value_range": value_range,
-        "layout": layout,
-        "channels": channels,
-        "max_batch": max_batch,
-    }
-    options = {key: value for key, value in all_options.items() if value is not None}
+    options = _drop_unset(
+        input_size=input_size,
+        mean=mean,
+        std=std,
+        value_range=value_range,
+        layout=layout,
+        channels=channels,
+        max_batch=max_batch,
+    )
     read = read or (task and task.reader)
     names = None if labels is None else read_labels(labels)
     origin = find_labels_origin(labels)
@@ -197,6 +196,11 @@ def load_model(
     if isinstance(spec, (str, os.PathLike)) and is_named_alone:
         return replace(model, spec=os.fspath(spec))
     return model
+
+
+def _drop_unset(**options: Any) -> dict[str, Any]:
+    """Return the options that are not None."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _with_training_arguments(source: Source) -> Source:

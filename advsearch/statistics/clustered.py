@@ -151,24 +151,36 @@ def compare_paired(
     second = np.asarray(second, dtype=bool)
     n_rows = len(first)
     if len(np.unique(units)) == n_rows:
-        n_both = int((first & second).sum())
-        n_first = int((first & ~second).sum())
-        n_second = int((~first & second).sum())
-        n_neither = n_rows - (n_both + n_first + n_second)
-        difference, interval = paired_difference(n_both, n_first, n_second, n_neither)
-        return difference, interval, mcnemar(n_first, n_second)
+        return _compare_independent_rows(first, second)
     unit_rows = sum_per_unit(np.ones(n_rows), units)
     # 0 where only the first happens, 1 where only the second does, else 1/2
     unit_advantage = sum_per_unit((1.0 + second - 1.0 * first) / 2.0, units) / unit_rows
     lower, upper = _betting_interval(unit_advantage, CONFIDENCE)
-    once = np.ones(len(unit_rows))
-    log_capital_second = log_capital(0.5, unit_advantage, once)
-    log_capital_first = log_capital(0.5, 1.0 - unit_advantage, once)
-    max_log_capital = max(log_capital_second, log_capital_first)
+    copies = np.ones(len(unit_rows))
+    max_log_capital = max(
+        log_capital(0.5, unit_advantage, copies),
+        log_capital(0.5, 1.0 - unit_advantage, copies),
+    )
     second_rate = mean_rate(sum_per_unit(second, units), unit_rows)
     first_rate = mean_rate(sum_per_unit(first, units), unit_rows)
     p_value = float(min(1.0, 2.0 * np.exp(-max_log_capital)))
     return second_rate - first_rate, (2 * lower - 1, 2 * upper - 1), p_value
+
+
+def _compare_independent_rows(
+    first: npt.NDArray[np.bool_], second: npt.NDArray[np.bool_]
+) -> tuple[float, tuple[float, float], float]:
+    """Compare two outcomes (n,) of independent rows by the tests of Newcombe and McNemar.
+
+    Returns:
+        As `compare_paired`.
+    """
+    n_both = int((first & second).sum())
+    n_first = int((first & ~second).sum())
+    n_second = int((~first & second).sum())
+    n_neither = len(first) - (n_both + n_first + n_second)
+    difference, interval = paired_difference(n_both, n_first, n_second, n_neither)
+    return difference, interval, mcnemar(n_first, n_second)
 
 
 # rates, the same inside and outside, under which the bets of the test are computed

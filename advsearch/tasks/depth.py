@@ -121,11 +121,11 @@ class DepthTruth:
         left_disparity = disparity.gather(1, left.clamp_min(0))
         right_disparity = disparity.gather(1, right.clamp_max(width - 1))
         weight = (column - left) / (right - left).clamp_min(1)
-        between = left_disparity + weight * (right_disparity - left_disparity)
+        result = left_disparity + weight * (right_disparity - left_disparity)
         has_left = left >= 0
         has_right = right != width
-        from_right = torch.where(has_right, between, left_disparity)
-        result = torch.where(has_left, from_right, right_disparity)
+        result = torch.where(has_right, result, left_disparity)
+        result = torch.where(has_left, result, right_disparity)
         return torch.where(has_left | has_right, result, math.nan)
 
 
@@ -260,7 +260,8 @@ class Depth(Task):
             return (
                 "it predicts up to a scale and a shift, which are found on what is "
                 "seen beside the object: expected "
-                f"{MIN_FIT_PIXELS} pixels at distances that differ by a factor of {MIN_DISTANCE_RATIO:g}, "
+                f"{MIN_FIT_PIXELS} pixels at distances that differ by a factor of "
+                f"{MIN_DISTANCE_RATIO:g}, "
                 f"got {int(truth.outside_object.sum())}; "
                 "give a scene with a ground or a room, and a camera that sees it from "
                 "the side"

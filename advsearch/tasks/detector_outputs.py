@@ -171,26 +171,26 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
         and returned.shape[0] == count
         and returned.shape[2] != 4
     )
-    # Rows of a box, a score, a class and mask coefficients.
-    is_rows_with_masks = (
-        is_grid
-        and returned.shape[2] - 6 in channels
-        and bool((returned[..., 5] == returned[..., 5].round()).all())
-    )
+    is_rows_with_masks = is_grid and _has_mask_rows(returned, channels)
     is_rows = bool(order_names) or is_rows_with_masks
     if is_grid and (order in HEAD_ORDERS or not (is_rows or returned.shape[2] == 6)):
         return [
             {"raw": grid.float(), "map_channels": map_channels} for grid in returned
         ]
     if is_rows_with_masks:
-        return [
-            {**detections, "map_channels": map_channels}
-            for detections in read_detections(returned[..., :6], count, order)
-        ]
+        rows = read_detections(returned[..., :6], count, order)
+        return [{**detections, "map_channels": map_channels} for detections in rows]
     if "objectness" in order_names or "channels" in order_names:
         raise ValueError(EXPECTED)
-    images = _split_images(returned, count, order_names)
-    return [_checked_detections(components) for components in images]
+    return list(map(_checked_detections, _split_images(returned, count, order_names)))
+
+
+def _has_mask_rows(grid: Tensor, channels: Collection[int]) -> bool:
+    """Return whether rows (N, D, k) are a box, a score, a class and mask coefficients."""
+    if grid.shape[2] - 6 not in channels:
+        return False
+    class_column = grid[..., 5]
+    return bool((class_column == class_column.round()).all())
 
 
 def _split_queries(boxes: Tensor, logits: Tensor) -> list[Detections]:

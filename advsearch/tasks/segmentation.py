@@ -217,11 +217,7 @@ class Segmentation(tasks.ClassTask):
             prediction, outcome = self._describe_object(
                 counts, truth, accuracy, is_right=margin >= 0.0
             )
-            fraction_by_class = {
-                self.get_class_name(class_id): round(class_count / len(pixels), 4)
-                for class_id, class_count in enumerate(counts.tolist())
-                if class_count
-            }
+            fraction_by_class = self._compute_class_fractions(counts, len(pixels))
             payload: tasks.JsonValue = {
                 tasks.OUTCOME: outcome.value,
                 "accuracy": round(accuracy, 4),
@@ -230,6 +226,21 @@ class Segmentation(tasks.ClassTask):
             }
             results.append((prediction, payload))
         return results
+
+    def _compute_class_fractions(
+        self, counts: Tensor, n_pixels: int
+    ) -> dict[str, tasks.JsonValue]:
+        """Return the fraction of the pixels by name of each class that has any.
+
+        Args:
+            counts: pixels by class, (classes,).
+            n_pixels: in all.
+        """
+        return {
+            self.get_class_name(class_id): round(class_count / n_pixels, 4)
+            for class_id, class_count in enumerate(counts.tolist())
+            if class_count
+        }
 
     def _describe_object(
         self,

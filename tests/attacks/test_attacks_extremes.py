@@ -28,7 +28,7 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.domain import project_l2_box
-from advsearch.attacks.evaluation import use_one_thread
+from advsearch.attacks.evaluation import limit_to_single_thread
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.controls.base import Parameter
 from advsearch.controls.ranges import Range, parse_spec
@@ -253,7 +253,7 @@ def test_verdicts_in_single_and_double_precision_differ_only_on_the_boundary() -
     pictures = large.clamp(0.0, 1.0).permute(0, 2, 3, 1)
 
     def answers(images: Tensor) -> tuple[Tensor, Tensor]:
-        with torch.no_grad(), use_one_thread():
+        with torch.no_grad(), limit_to_single_thread():
             x = model.preprocessing(images)
             return model.module(x), exact(x.double())
 

@@ -25,8 +25,8 @@ def test_what_holds_too_seldom_is_seldom_found_whatever_chooses(study: dict[str,
     """At .5 and by 6 of 6, or by trials that the sample count has looked at, some of these would be found."""
     checks = [study["checked"](0.5, root, failures=4) for root in range(20)]
     assert not any(one.verification.ending is Ending.FOUND for one in checks)
-    assert not any(failure.ending is Ending.FOUND for one in checks for failure in one.failures)
-    covered = [one.verification.adversarial.interval for one in checks]
+    assert not any(failure.ending is Ending.FOUND for one in checks for failure in one.failure_verifications)
+    covered = [one.verification.adversarial_counts.interval for one in checks]
     assert np.mean([low <= 0.5 <= high for low, high in covered]) >= 0.85
 
 
@@ -34,10 +34,10 @@ def test_what_holds_too_seldom_is_seldom_found_whatever_chooses(study: dict[str,
 def test_a_configuration_that_is_chosen_by_its_trials_is_tried_in_others(study: dict[str, Any]) -> None:
     """The random search's answer is the run's only by trials that come after those by which it was chosen."""
     checks = [study["checked"](0.9, root) for root in range(20)]
-    chosen = [one for one in checks if one.beaten is not None]
+    chosen = [one for one in checks if one.outdone_verification is not None]
     assert chosen, "else there is nothing to see"
     for one in checks:
-        assert one.verification.begin == (TRIAL_LOOKS[-1] if one.beaten is not None else 0)
+        assert one.verification.first_index == (TRIAL_LOOKS[-1] if one.outdone_verification is not None else 0)
     for one in chosen:
         assert len(one.verification.clean_trials) >= TRIAL_LOOKS[0] and one.baseline_verification is one.verification
 
@@ -45,7 +45,7 @@ def test_a_configuration_that_is_chosen_by_its_trials_is_tried_in_others(study: 
 @pytest.mark.medium
 def test_a_configuration_that_wins_once_and_not_again_is_not_the_runs(study: dict[str, Any]) -> None:
     checks = [study["checked"](0.9, root) for root in range(20)]
-    assert any(one.beaten is None and one.baseline_verification.begin > 0 for one in checks)
+    assert any(one.outdone_verification is None and one.baseline_verification.first_index > 0 for one in checks)
 
 
 # ---- samples for a rate

@@ -24,8 +24,8 @@ from advsearch.attacks.evaluation import (
     Policy,
     Proposal,
     draw_seed,
+    limit_to_single_thread,
     seeded,
-    use_one_thread,
 )
 from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts, WithoutAscent
 from advsearch.attacks.policies.choices import Choices
@@ -80,17 +80,17 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
     policy = POLICIES[name]
     check_options("policy", name, policy, options)
     if "policy" in options:
-        options["policy"] = _nested(options["policy"], f"policy of {name}")
+        options["policy"] = _make_nested_policy(options["policy"], f"policy of {name}")
     if "policies" in options:
         specs = options["policies"]
         specs = specs if isinstance(specs, (list, tuple)) else [specs]
         options["policies"] = tuple(
-            _nested(spec, f"policies of {name}") for spec in specs
+            _make_nested_policy(spec, f"policies of {name}") for spec in specs
         )
     return policy(**options)
 
 
-def _nested(spec: Spec, where: str) -> Policy[Any]:
+def _make_nested_policy(spec: Spec, where: str) -> Policy[Any]:
     if isinstance(spec, Policy):
         return spec
     if isinstance(spec, str):
@@ -136,9 +136,9 @@ __all__ = [
     "estimate_failure_rate",
     "find_box_coordinates",
     "find_periodic",
+    "limit_to_single_thread",
     "make_policy",
     "option_center",
     "seeded",
     "select_diverse",
-    "use_one_thread",
 ]

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any, ClassVar
@@ -16,29 +17,29 @@ from torch import Tensor
 
 from advsearch.extend import InputError, Policy, errors, policies, seeds
 
-MOST = 10_000  # more numbers are refused: every cell keeps a whole configuration
-MOST_CELLS = 1_000_000  # an archive has no more
+MAX_DIM = 10_000  # more numbers are refused: every cell keeps a whole configuration
+MAX_CELLS = 1_000_000  # an archive has no more
 # parameters that span it; with more, nearly every configuration has a cell of its own
-MOST_SPANNED = 4
+MAX_MEASURES = 4
 # share of the configurations, and of the discrete choices, that are drawn anew
-ANEW = 0.1
+RESAMPLED_FRACTION = 0.1
 # so many kept configurations are drawn, and the one with the largest objective is
 # changed
 TOURNAMENT = 4
 SIGMA = 0.1
-LINE = 0.3
+LINE_SIGMA = 0.3
 """Standard deviations of a step, in half of each number's range, and of one along the
 line through two configurations, in their distance.
 """
 
 # how much larger steps are in the parameters that span the archive: that is where there
 # are cells to fill
-WIDER = 4.0
-CANDIDATES = 300  # configurations that the surrogate chooses a generation from
-ELSEWHERE = 0.5  # share of these whose parameters of the archive are drawn anew
+MEASURE_SIGMA_FACTOR = 4.0
+N_CANDIDATES = 300  # configurations that the surrogate chooses a generation from
+ANY_CELL_FRACTION = 0.5  # share of these whose parameters of the archive are drawn anew
 # what a larger objective in a cell that fails already counts for, beside a failure in
 # another
-BETTER = 0.1
+IMPROVEMENT_WEIGHT = 0.1
 # the surrogate is made from so many of the best configurations and so many of the
 # latest
 MEMORY = 300
@@ -90,6 +91,26 @@ class ArchiveState:
         sample (n, d).
         """
         count, dim = samples.shape
+        first, second = self._sample_parents(count)
+        noise = torch.randn(count, dim, generator=rng)
+        noise[:, self.measure_indices] *= MEASURE_SIGMA_FACTOR
+        line_step = LINE_SIGMA * torch.randn(count, 1, generator=rng)
+        offspring: Tensor = (
+            first + SIGMA * self.half_widths * noise + line_step * (second - first)
+        )
+        is_resampled = torch.rand(count, dim, generator=rng) < RESAMPLED_FRACTION
+        for block, part in self.domain.list_block_slices():
+            if block.options:
+                offspring[:, part] = torch.where(
+                    is_resampled[:, part], samples[:, part], first[:, part]
+                )
+        return offspring
+
+    def _sample_parents(self, count: int) -> tuple[Tensor, Tensor]:
+        """Return two parents (count, d) of each offspring.
+
+        The first is the best of `TOURNAMENT` elites, the second any elite.
+        """
         # Sampling changes the generator of an archive.
         archive = copy.deepcopy(self.archive)
         elites = archive.sample_elites((TOURNAMENT + 1) * count)
@@ -97,21 +118,7 @@ class ArchiveState:
         solutions = torch.from_numpy(elites["solution"]).unflatten(0, shape)
         objectives = torch.from_numpy(elites["objective"]).unflatten(0, shape)
         winner = objectives[1:].argmax(0)
-        first = solutions[1 + winner, torch.arange(count)]
-        second = solutions[0]
-        noise = torch.randn(count, dim, generator=rng)
-        noise[:, self.measure_indices] *= WIDER
-        line_step = LINE * torch.randn(count, 1, generator=rng)
-        offspring: Tensor = (
-            first + SIGMA * self.half_widths * noise + line_step * (second - first)
-        )
-        is_resampled = torch.rand(count, dim, generator=rng) < ANEW
-        for block, part in self.domain.list_block_slices():
-            if block.options:
-                offspring[:, part] = torch.where(
-                    is_resampled[:, part], samples[:, part], first[:, part]
-                )
-        return offspring
+        return solutions[1 + winner, torch.arange(count)], solutions[0]
 
     def select_most_promising(
         self, surrogate: policies.Surrogate, points: Tensor, count: int
@@ -120,9 +127,27 @@ class ArchiveState:
 
         They are of different cells as long as there are enough: those that most likely
         fail where nothing fails yet. Where something does, a larger objective than its
-        own counts for `BETTER` as much.
+        own counts for `IMPROVEMENT_WEIGHT` as much.
         """
         mean, deviation = surrogate.predict(surrogate.space.from_configuration(points))
+        objective_of_cell, threshold = self._find_objectives_to_beat()
+        measures = points[:, self.measure_indices].double().numpy()
+        cells = self.archive.index_of(measures).tolist()
+        to_beat = torch.tensor(
+            [objective_of_cell.get(cell, threshold) for cell in cells]
+        )
+        weight = torch.tensor(
+            [IMPROVEMENT_WEIGHT if cell in objective_of_cell else 1.0 for cell in cells]
+        )
+        promise = weight * torch.special.ndtr((mean - to_beat) / deviation)
+        order = promise.argsort(descending=True, stable=True).tolist()
+        return points[_order_by_cell(order, cells)[:count]]
+
+    def _find_objectives_to_beat(self) -> tuple[dict[int, float], float]:
+        """Return the objectives of cells that fail, and the one to beat elsewhere.
+
+        Elsewhere it is the smallest of a failure, or without one the largest of all.
+        """
         elites = self.archive.data()
         objectives = torch.from_numpy(elites["objective"])
         is_wrong = torch.from_numpy(elites["wrong"])
@@ -131,29 +156,52 @@ class ArchiveState:
         objective_of_cell = dict(
             zip(wrong_cells, wrong_objectives.tolist(), strict=True)
         )
-        threshold = float(
-            wrong_objectives.min() if bool(is_wrong.any()) else objectives.max()
-        )
-        measures = points[:, self.measure_indices].double().numpy()
-        cells = self.archive.index_of(measures).tolist()
-        to_beat = torch.tensor(
-            [objective_of_cell.get(cell, threshold) for cell in cells]
-        )
-        weight = torch.tensor(
-            [BETTER if cell in objective_of_cell else 1.0 for cell in cells]
-        )
-        promise = weight * torch.special.ndtr((mean - to_beat) / deviation)
-        order = promise.argsort(descending=True, stable=True).tolist()
-        return points[_one_per_cell_first(order, cells)[:count]]
+        if bool(is_wrong.any()):
+            return objective_of_cell, float(wrong_objectives.min())
+        return objective_of_cell, float(objectives.max())
 
 
-def _one_per_cell_first(order: list[int], cells: list[int]) -> list[int]:
+def _order_by_cell(order: list[int], cells: list[int]) -> list[int]:
     """Return the order with the first candidate of each cell before all others."""
     first_of_cell = dict[int, int]()
     for index in order:
         first_of_cell.setdefault(cells[index], index)
     others = [index for index in order if first_of_cell[cells[index]] != index]
     return [*first_of_cell.values(), *others]
+
+
+def _find_cell_ranges(
+    measure_indices: Sequence[int],
+    boundaries: Sequence[Any],
+    grid_index: Sequence[int],
+) -> dict[int, tuple[float, float]]:
+    """Return the range of each parameter of the archive in one of its cells."""
+    return {
+        measure: (float(edges[cell]), float(edges[cell + 1]))
+        for measure, edges, cell in zip(
+            measure_indices, boundaries, grid_index, strict=True
+        )
+    }
+
+
+def _make_candidates(
+    state: ArchiveState, observations: policies.Observations, rng: torch.Generator
+) -> Tensor:
+    """Return candidates (n, d) for a surrogate to choose from: offspring in the box.
+
+    The parameters of the archive of some of them are sampled uniformly, so that they
+    may lie in any cell.
+    """
+    box = observations.space
+    uniform = torch.rand(N_CANDIDATES, box.count, generator=rng)
+    samples = box.low + box.width * uniform
+    offspring = state.make_offspring(samples, rng)
+    n_any_cell = int(ANY_CELL_FRACTION * N_CANDIDATES)
+    offspring[:n_any_cell, state.measure_indices] = samples[
+        :n_any_cell, state.measure_indices
+    ]
+    x = box.normalize((offspring - box.low) / box.width)
+    return box.to_configuration(offspring, x)
 
 
 @dataclass(frozen=True)
@@ -214,17 +262,20 @@ class MapElites(Policy[ArchiveState]):
     def start(
         self, domain: policies.Domain, generator: torch.Generator, steps: int
     ) -> ArchiveState:
-        if domain.dim > MOST:
+        if domain.dim > MAX_DIM:
             raise InputError(
-                f"policy 'archive': expected at most {MOST} numbers, got "
+                f"policy 'archive': expected at most {MAX_DIM} numbers, got "
                 f"{domain.dim}; use pgd or auto"
             )
         seed = policies.draw_seed(generator)
-        spanned = self._spanned(domain)
-        dims = [options or self.cells for options in domain.options[spanned].tolist()]
-        if math.prod(dims) > MOST_CELLS:
+        measure_indices = self._find_measure_indices(domain)
+        dims = [
+            options or self.cells
+            for options in domain.options[measure_indices].tolist()
+        ]
+        if math.prod(dims) > MAX_CELLS:
             raise InputError(
-                f"cells: expected at most {MOST_CELLS} in all, got "
+                f"cells: expected at most {MAX_CELLS} in all, got "
                 f"{math.prod(dims)}; set `cells` lower"
             )
         from ribs import archives  # an extra, and it takes seconds
@@ -235,8 +286,8 @@ class MapElites(Policy[ArchiveState]):
             seed=seeds.stream(seed, "archive"),
             ranges=list(
                 zip(
-                    domain.lower[spanned].tolist(),
-                    domain.upper[spanned].tolist(),
+                    domain.lower[measure_indices].tolist(),
+                    domain.upper[measure_indices].tolist(),
                     strict=True,
                 )
             ),
@@ -245,26 +296,26 @@ class MapElites(Policy[ArchiveState]):
             measures_dtype=np.float64,
             extra_fields={"wrong": ((), np.bool_)},
         )
-        first = [
+        first_points = [
             domain.begin[None],
             domain.sample(policies.seeded(seed, 0), self.population - 1),
         ]
         box = policies.find_box_coordinates(domain)
-        few = box.count == domain.dim <= policies.MAX_SCALED_DIM
-        seen = (
+        is_low_dimensional = box.count == domain.dim <= policies.MAX_SCALED_DIM
+        observations = (
             policies.Observations(box, torch.empty(0, box.count), memory=MEMORY)
-            if few
+            if is_low_dimensional
             else None
         )
         return ArchiveState(
             domain,
             seed,
-            spanned,
+            measure_indices,
             policies.compute_half_widths(domain),
             archive,
             0,
-            torch.cat(first),
-            observations=seen,
+            torch.cat(first_points),
+            observations=observations,
         )
 
     def propose(
@@ -278,15 +329,20 @@ class MapElites(Policy[ArchiveState]):
         self, state: ArchiveState, evaluated: policies.Evaluated
     ) -> ArchiveState:
         values = (*state.values, *(evaluation.objective for _, evaluation in evaluated))
-        wrong = (*state.successes, *(evaluation.success for _, evaluation in evaluated))
-        seen = (
+        successes = (
+            *state.successes,
+            *(evaluation.success for _, evaluation in evaluated),
+        )
+        observations = (
             None if state.observations is None else state.observations.extend(evaluated)
         )
-        state = replace(state, values=values, successes=wrong, observations=seen)
+        state = replace(
+            state, values=values, successes=successes, observations=observations
+        )
         return (
             state
             if len(values) < len(state.points)
-            else self._next(state.add_generation())
+            else self._start_generation(state.add_generation())
         )
 
     def failures(self, state: ArchiveState) -> policies.Failures:
@@ -302,25 +358,19 @@ class MapElites(Policy[ArchiveState]):
         objectives = elites["objective"][wrong].tolist()
         is_periodic = policies.find_periodic(state.domain)[state.measure_indices]
         is_discrete = state.domain.options[state.measure_indices] > 0
-        chosen = policies.select_diverse(
+        diverse_indices = policies.select_diverse(
             torch.from_numpy(grid_indices / archive.dims),
             objectives,
             is_periodic,
             is_discrete,
         )
         examples = []
-        for number in chosen:
-            ranges = {
-                measure: (float(edges[cell]), float(edges[cell + 1]))
-                for measure, edges, cell in zip(
-                    measure_indices,
-                    archive.boundaries,
-                    grid_indices[number],
-                    strict=True,
-                )
-            }
-            u = torch.from_numpy(elites["solution"][wrong[number]].copy())
-            examples.append(policies.FoundFailure(u, objectives[number], ranges))
+        for index in diverse_indices:
+            ranges = _find_cell_ranges(
+                measure_indices, archive.boundaries, grid_indices[index]
+            )
+            u = torch.from_numpy(elites["solution"][wrong[index]].copy())
+            examples.append(policies.FoundFailure(u, objectives[index], ranges))
         return policies.Failures(
             tuple(examples),
             measure_indices,
@@ -329,14 +379,16 @@ class MapElites(Policy[ArchiveState]):
             int(archive.cells),
         )
 
-    def _next(self, state: ArchiveState) -> ArchiveState:
+    def _start_generation(self, state: ArchiveState) -> ArchiveState:
         """Begin the next generation; no other state has the archive yet."""
         state = replace(state, generation=state.generation + 1, values=(), successes=())
         domain = state.domain
         rng = policies.seeded(state.seed, state.generation)
         if state.archive.empty:
             return replace(state, points=domain.sample(rng, self.population))
-        n_new = int((torch.rand(self.population, generator=rng) < ANEW).sum())
+        n_new = int(
+            (torch.rand(self.population, generator=rng) < RESAMPLED_FRACTION).sum()
+        )
         samples = domain.sample(rng, self.population)
         observations = state.observations
         if observations is None:
@@ -344,27 +396,16 @@ class MapElites(Policy[ArchiveState]):
                 domain.project(u) for u in state.make_offspring(samples[n_new:], rng)
             ]
             return replace(state, points=torch.stack([*samples[:n_new], *offspring]))
-        with policies.use_one_thread():
+        with policies.limit_to_single_thread():
             surrogate, observations = observations.fit_surrogate()
-            box = observations.space
-            uniform = torch.rand(CANDIDATES, box.count, generator=rng)
-            candidates = box.low + box.width * uniform
-            offspring_points = state.make_offspring(candidates, rng)
-            # Some are moved to any cell.
-            n_moved = int(ELSEWHERE * CANDIDATES)
-            offspring_points[:n_moved, state.measure_indices] = candidates[
-                :n_moved, state.measure_indices
-            ]
-            x = box.normalize((offspring_points - box.low) / box.width)
+            candidates = _make_candidates(state, observations, rng)
             points = state.select_most_promising(
-                surrogate,
-                box.to_configuration(offspring_points, x),
-                self.population - n_new,
+                surrogate, candidates, self.population - n_new
             )
         points = torch.cat([samples[:n_new], points])
         return replace(state, points=points, observations=observations)
 
-    def _spanned(self, domain: policies.Domain) -> Tensor:
+    def _find_measure_indices(self, domain: policies.Domain) -> Tensor:
         """Return the indices (k,) of the parameters that span the archive."""
         names = [name.strip() for name in self.over.split(",") if name.strip()]
         if not names:
@@ -375,9 +416,9 @@ class MapElites(Policy[ArchiveState]):
                 raise errors.UnknownNameError(
                     "parameter in `over` of policy 'archive':", name, index_of_name
                 )
-        if len(set(names)) != len(names) or len(names) > MOST_SPANNED:
+        if len(set(names)) != len(names) or len(names) > MAX_MEASURES:
             raise InputError(
-                f"over: expected 1 to {MOST_SPANNED} different "
+                f"over: expected 1 to {MAX_MEASURES} different "
                 f"parameters, got {', '.join(names)}"
             )
         return torch.tensor([index_of_name[name] for name in names])

@@ -21,8 +21,8 @@ from advsearch.attacks.evaluation import (
     Proposal,
     WhichGradient,
     draw_seed,
+    limit_to_single_thread,
     seeded,
-    use_one_thread,
 )
 from advsearch.attacks.policies.choices import (
     Race,
@@ -187,29 +187,29 @@ class Auto(Policy[AutoState]):
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> AutoState:
         box = find_box_coordinates(domain)
-        nothing = torch.empty(0, box.count)
+        no_points = torch.empty(0, box.count)
         plan = make_plan(domain, box, steps)
-        seen = Observations(box, nothing)
+        observations = Observations(box, no_points)
         if box.count == 0:
             return AutoState(
                 domain,
-                seen,
+                observations,
                 plan,
                 0,
-                nothing,
+                no_points,
                 ascent=_pgd(domain).start(domain, generator, steps),
             )
         seed = draw_seed(generator)
-        with use_one_thread():
+        with limit_to_single_thread():
             screen = box.sample_screen(seed, max(0, plan.screen - 1))
-        return AutoState(domain, seen, plan, seed, screen)
+        return AutoState(domain, observations, plan, seed, screen)
 
     def propose(
         self, state: AutoState, n: int
     ) -> tuple[tuple[Proposal, ...], AutoState]:
         state = replace(state, is_climbing=False, box_before_trial=None)
         if state.ascent is None and state.renders_spent >= state.plan.ascent_start:
-            with use_one_thread():
+            with limit_to_single_thread():
                 state = self._begin_ascent(state)
         if state.ascent is not None:
             steps, ascent = _pgd(state.domain).propose(state.ascent, n)
@@ -236,7 +236,7 @@ class Auto(Policy[AutoState]):
             state.to_configuration, state.screen[max(0, done - 1) :][: n - len(us)]
         )
         if not us:
-            with use_one_thread():
+            with limit_to_single_thread():
                 x, state = self._next_point(state)
             us = [state.to_configuration(x)]
         return tuple(map(Proposal, us)), state
@@ -277,22 +277,25 @@ class Auto(Policy[AutoState]):
         generator = seeded(state.seed, len(state.observations.values))
         if not state.observations.has_finite:
             return box.normalize(torch.rand(box.count, generator=generator)), state
-        surrogate, seen = state.observations.fit_surrogate()
-        best = surrogate.x[
+        surrogate, observations = state.observations.fit_surrogate()
+        best_points = surrogate.x[
             surrogate.predict(surrogate.x)[0].argsort(descending=True, stable=True)
         ]
         centres = torch.randint(
-            0, min(N_CENTERS, len(best)), (N_NEAR_CANDIDATES,), generator=generator
+            0,
+            min(N_CENTERS, len(best_points)),
+            (N_NEAR_CANDIDATES,),
+            generator=generator,
         )
         centres[: N_NEAR_CANDIDATES // 2] = 0
-        near = box.sample_moves(best[centres], generator)
-        far = box.normalize(
+        near_candidates = box.sample_moves(best_points[centres], generator)
+        far_candidates = box.normalize(
             torch.rand(N_FAR_CANDIDATES, box.count, generator=generator)
         )
-        candidates = torch.cat([best[:1], near, far])
+        candidates = torch.cat([best_points[:1], near_candidates, far_candidates])
         mean, deviation = surrogate.predict(candidates)
         return candidates[int((mean + UCB_KAPPA * deviation).argmax())], replace(
-            state, observations=seen
+            state, observations=observations
         )
 
     def _begin_ascent(self, state: AutoState) -> AutoState:
@@ -302,17 +305,17 @@ class Auto(Policy[AutoState]):
         x = state.box.from_configuration(state.domain.begin)
         blocks = state.domain.blocks
         if state.observations.has_finite:
-            surrogate, seen = state.observations.fit_surrogate()
-            state = replace(state, observations=seen)
+            surrogate, observations = state.observations.fit_surrogate()
+            state = replace(state, observations=observations)
             x = surrogate.x[int(surrogate.predict(surrogate.x)[0].argmax())]
-        shortened = (
+        ascent_blocks = (
             replace(
                 block,
                 reach=ASCENT_REACH * block.radius if block.norm == "box" else None,
             )
             for block in blocks
         )
-        domain = replace(state.domain, blocks=tuple(shortened))
+        domain = replace(state.domain, blocks=tuple(ascent_blocks))
         ascent = _pgd(domain).start(
             domain,
             seeded(state.seed, 0),

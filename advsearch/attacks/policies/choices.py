@@ -65,9 +65,9 @@ class Race:
     runner_of_proposal: tuple[int, ...] = ()
 
     @property
-    def find_leader(self) -> int:
-        """The number of the search that has met the largest objective so far, the first
-        of equals.
+    def leader(self) -> int:
+        """The index of the search with the largest objective so far, the first of
+        equals.
         """
         return max(
             range(len(self.runners)), key=lambda k: self.runners[k].best_objective
@@ -95,7 +95,7 @@ class Race:
         There are none where the round is over.
         """
         runners = list(self.runners)
-        waiting = [k for k in self.active_runners if runners[k].renders_left]
+        waiting = self._find_waiting(runners)
         proposals_each = -(-n // max(1, len(waiting)))
         proposals = dict[int, tuple[Proposal, ...]]()
         n_used = Counter[int]()
@@ -105,15 +105,13 @@ class Race:
             k = max(
                 waiting, key=lambda k: runners[k].renders_left
             )  # the first of equals
+            proposer = runners[k]
             if k not in proposals:
-                runner = runners[k]
-                proposals[k], state = runner.policy.propose(
-                    runner.state, min(proposals_each, runner.renders_left)
+                proposals[k], state = proposer.policy.propose(
+                    proposer.state, min(proposals_each, proposer.renders_left)
                 )
                 # The runner is changed only where its proposals are used.
-                proposer = replace(runner, state=state)
-            else:
-                proposer = runners[k]
+                proposer = replace(proposer, state=state)
             if not proposals[k]:
                 self._retire(runners, k)
             elif n_used[k] == len(proposals[k]):
@@ -124,20 +122,23 @@ class Race:
                 batch.append(proposal)
                 runner_of_proposal.append(k)
                 n_used[k] += 1
-                renders_left = proposer.renders_left - proposal.max_cost(
-                    proposer.domain
+                cost = proposal.max_cost(proposer.domain)
+                runners[k] = replace(
+                    proposer, renders_left=proposer.renders_left - cost
                 )
-                runners[k] = replace(proposer, renders_left=renders_left)
-            waiting = [k for k in self.active_runners if runners[k].renders_left]
+            waiting = self._find_waiting(runners)
         for k, count in n_used.items():
             if count < len(proposals[k]):
                 # Its state must not count on more proposals than were used.
                 _, state = runners[k].policy.propose(self.runners[k].state, count)
                 runners[k] = replace(runners[k], state=state)
-        race = replace(
+        return tuple(batch), replace(
             self, runners=tuple(runners), runner_of_proposal=tuple(runner_of_proposal)
         )
-        return tuple(batch), race
+
+    def _find_waiting(self, runners: Sequence[Runner]) -> list[int]:
+        """Return the indices of active runners that have renders left."""
+        return [index for index in self.active_runners if runners[index].renders_left]
 
     def _retire(self, runners: list[Runner], k: int) -> None:
         """End a search that has nothing more to propose, in a list of runners.
@@ -262,7 +263,7 @@ class RacingPolicy(Policy[Racing]):
         )
 
     def distribution(self, state: Racing) -> Distribution | None:
-        runner = state.runners[state.find_leader]
+        runner = state.runners[state.leader]
         return runner.policy.distribution(runner.state)
 
     def failures(self, state: Racing) -> Failures | None:
@@ -280,10 +281,10 @@ class RacingPolicy(Policy[Racing]):
         )
 
 
-MOST = 256  # no more combinations than this take part
+MAX_COMBINATIONS = 256  # no more combinations than this take part
 # nor more, but two, that have so many numbers together: each search keeps some such
 # vectors
-MOST_NUMBERS = 2**24
+MAX_NUMBERS = 2**24
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -345,12 +346,11 @@ class Choices(RacingPolicy[ChoicesState]):
             inner = replace(
                 domain, start=domain.start[numbers], blocks=blocks, first=first
             )
-        counts = options[choices].tolist()
-        each = 1 + (domain.gradient_cost if policy.uses_gradient else 0)
-        limit = min(MOST, math.prod(counts), max(2, MOST_NUMBERS // domain.dim))
-        most = max_runners(steps, each, limit)
-        combinations = _combinations(
-            counts, domain.begin[choices], most, seeded(seed, 0)
+        combinations = _select_combinations(
+            options[choices].tolist(),
+            domain.begin[choices],
+            _count_runners(domain, policy, steps),
+            seeded(seed, 0),
         )
         race = start_race([(policy, inner)] * len(combinations), steps, seed)
         return ChoicesState(
@@ -365,11 +365,13 @@ class Choices(RacingPolicy[ChoicesState]):
         self, state: ChoicesState, n: int
     ) -> tuple[tuple[Proposal, ...], ChoicesState]:
         proposals, state = super().propose(state, n)
-        asked = zip(proposals, state.runner_of_proposal, strict=True)
-        return tuple(
-            replace(proposal, u=state.join_choices(proposal.u, number))
-            for proposal, number in asked
-        ), state
+        joined = tuple(
+            replace(proposal, u=state.join_choices(proposal.u, runner))
+            for proposal, runner in zip(
+                proposals, state.runner_of_proposal, strict=True
+            )
+        )
+        return joined, state
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
         inner = []
@@ -387,9 +389,7 @@ class Choices(RacingPolicy[ChoicesState]):
             return None
         deviation = torch.zeros_like(state.domain.start)
         deviation[state.numbers] = inner.deviation
-        return Distribution(
-            state.join_choices(inner.mean, state.find_leader), deviation
-        )
+        return Distribution(state.join_choices(inner.mean, state.leader), deviation)
 
     def failures(self, state: ChoicesState) -> None:
         """None: those of a search are without their choices."""
@@ -403,7 +403,15 @@ def wrap_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
     return Choices(policy) if discrete and not policy.handles_choices else policy
 
 
-def _combinations(
+def _count_runners(domain: Domain, policy: Policy[Any], steps: int) -> int:
+    """Return how many combinations of options can be searched in `steps` renders."""
+    n_combinations = math.prod(domain.options[domain.options > 0].tolist())
+    limit = min(MAX_COMBINATIONS, n_combinations, max(2, MAX_NUMBERS // domain.dim))
+    cost = 1 + (domain.gradient_cost if policy.uses_gradient else 0)
+    return max_runners(steps, cost, limit)
+
+
+def _select_combinations(
     counts: list[int], begin: Tensor, most: int, generator: torch.Generator
 ) -> Tensor:
     """Return (n, c) elements of u, that of the start first: all combinations in a
@@ -413,21 +421,21 @@ def _combinations(
     total = math.prod(counts)
     start = torch.floor(begin * sizes).long().clamp(max=sizes - 1)
     if total <= max(1024, 4 * most):
-        every = torch.cartesian_prod(
+        all_combinations = torch.cartesian_prod(
             *(torch.arange(count) for count in counts)
         ).reshape(total, len(counts))
-        every = every[torch.randperm(total, generator=generator)]
-        picked = every[~(every == start).all(dim=1)][: most - 1]
+        all_combinations = all_combinations[torch.randperm(total, generator=generator)]
+        selected = all_combinations[~(all_combinations == start).all(dim=1)][: most - 1]
     else:
         first = tuple(start.tolist())
-        seen = {first}
-        while len(seen) < most:
-            seen.add(
+        sampled = {first}
+        while len(sampled) < most:
+            sampled.add(
                 tuple(
                     int(torch.randint(count, (1,), generator=generator))
                     for count in counts
                 )
             )
-        picked = torch.tensor(sorted(seen - {first})).reshape(-1, len(counts))
-    middles = option_center((picked + 0.5) / sizes, sizes)
-    return torch.cat([begin[None], middles.to(begin.dtype)])
+        selected = torch.tensor(sorted(sampled - {first})).reshape(-1, len(counts))
+    centers = option_center((selected + 0.5) / sizes, sizes)
+    return torch.cat([begin[None], centers.to(begin.dtype)])

@@ -29,13 +29,13 @@ from advsearch.attacks.evaluation import (
     Policy,
     Proposal,
     draw_seed,
+    limit_to_single_thread,
     seeded,
-    use_one_thread,
 )
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
-FULL = 80
+MAX_FULL_DIM = 80
 """Up to so many numbers have a full covariance matrix; more have its diagonal (Ros and
 Hansen 2008). Also about the size from which the linear algebra would use several
 threads, whose last bits may differ.
@@ -43,9 +43,9 @@ threads, whose last bits may differ.
 
 # more numbers are refused: a generation would take longer than renders, and an ascent
 # is far ahead
-MOST = 10_000
-WIDEST = 10.0
-NARROWEST = 1e-3
+MAX_DIM = 10_000
+MAX_STEP_SIZE = 10.0
+MIN_STEP_SIZE = 1e-3
 """In half ranges: the step size grows no further (it does where all objectives are
 equal), and a run is over when its largest deviation is no more than this.
 """
@@ -188,7 +188,7 @@ class NES(Policy[NESState]):
         # weights sum to zero, so the -1 of every term drops out
         rate = (3.0 + math.log(d)) / (5.0 * math.sqrt(d))
         deviation = (state.deviation * wider.mul_(rate / 2.0).exp_()).clamp_(
-            NARROWEST, WIDEST
+            MIN_STEP_SIZE, MAX_STEP_SIZE
         )
         mean = state.domain.project(
             state.mean + state.scale * state.deviation * towards
@@ -205,7 +205,7 @@ class NES(Policy[NESState]):
         return Distribution(state.mean, state.scale * state.deviation)
 
 
-def _normal(*shape: int) -> Doubles:
+def _sample_normal(*shape: int) -> Doubles:
     """Standard normal numbers from numpy's global generator. (A copy of pycma's default
     carries its own along.)
     """
@@ -213,18 +213,18 @@ def _normal(*shape: int) -> Doubles:
 
 
 @contextmanager
-def _own_random(seed: int, generation: int) -> Iterator[None]:
+def _isolate_numpy_random(seed: int, generation: int) -> Iterator[None]:
     """Let pycma draw numbers of its own from numpy's global generator, and put that
     back; its warnings are not ours.
     """
-    before = np.random.get_state()  # noqa: NPY002
+    state_before = np.random.get_state()  # noqa: NPY002
     np.random.seed(stream(seed, "pycma", generation))  # noqa: NPY002
     try:
-        with warnings.catch_warnings(), use_one_thread():
+        with warnings.catch_warnings(), limit_to_single_thread():
             warnings.simplefilter("ignore")
             yield
     finally:
-        np.random.set_state(before)  # noqa: NPY002
+        np.random.set_state(state_before)  # noqa: NPY002
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +272,7 @@ class CMAESState:
     def ask(self) -> CMAESState:
         """Draw a generation; the strategy belongs to nobody else yet."""
         number = self.generation + 1
-        with _own_random(self.seed, number):
+        with _isolate_numpy_random(self.seed, number):
             points = np.array(self.strategy.ask())
         return replace(self, generation=number, points=points, values=(), outside=())
 
@@ -288,9 +288,9 @@ class CMAESState:
             values[:] = 0.0
         strategy = copy.deepcopy(self.strategy)
         penalty = spread * np.array(self.outside) / max(strategy.sigma, 1e-30) ** 2
-        with _own_random(self.seed, self.generation):
+        with _isolate_numpy_random(self.seed, self.generation):
             strategy.tell(list(self.points), list(penalty - values))
-        strategy.sigma = min(strategy.sigma, WIDEST)
+        strategy.sigma = min(strategy.sigma, MAX_STEP_SIZE)
         return replace(self, strategy=strategy)
 
 
@@ -350,14 +350,14 @@ class CMAES(Policy[CMAESState]):
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> CMAESState:
         d = domain.dim
-        if d > MOST:
+        if d > MAX_DIM:
             raise InputError(
-                f"policy 'cmaes': expected at most {MOST} numbers, got "
+                f"policy 'cmaes': expected at most {MAX_DIM} numbers, got "
                 f"{d}; use policy pgd, auto or nes"
             )
         population = self.population or 4 + int(3 * math.log(d))
         seed = draw_seed(generator)
-        strategy = self._strategy(d, population, seed)
+        strategy = self._make_strategy(d, population, seed)
         scale = compute_half_widths(domain)
         around = find_periodic(domain)
         none = np.empty((0, d))
@@ -387,14 +387,16 @@ class CMAES(Policy[CMAESState]):
         if len(state.values) < len(state.points):
             return state
         state = state.tell()
-        if float(state.deviations.max()) > NARROWEST:
+        if float(state.deviations.max()) > MIN_STEP_SIZE:
             return state.ask()
         # another run elsewhere, with twice the population; the better one of those that
         # are over is remembered
         before = state.before
         if before is None or state.best > before[0]:
             before = (state.best, state.distribution)
-        strategy = self._strategy(state.domain.dim, 2 * len(state.points), state.seed)
+        strategy = self._make_strategy(
+            state.domain.dim, 2 * len(state.points), state.seed
+        )
         origin = state.domain.sample(seeded(state.seed, state.generation))[0]
         return replace(
             state, origin=origin, strategy=strategy, best=-math.inf, before=before
@@ -405,15 +407,15 @@ class CMAES(Policy[CMAESState]):
             return state.before[1]
         return state.distribution
 
-    def _strategy(self, d: int, population: int, seed: int) -> Any:
+    def _make_strategy(self, d: int, population: int, seed: int) -> Any:
         options = {
-            "CMA_diagonal": d > FULL,
+            "CMA_diagonal": d > MAX_FULL_DIM,
             "popsize": population,
-            "randn": _normal,
+            "randn": _sample_normal,
             "seed": math.nan,
         }
         options |= {"signals_filename": "", "verbose": -9, "verb_log": 0}
-        with _own_random(seed, 0):
+        with _isolate_numpy_random(seed, 0):
             # takes most of a second, and complains where there is no matplotlib
             import cma
 

@@ -11,24 +11,28 @@ from torch import Tensor
 
 from advsearch.extend import InputError, Policy, policies
 
-MOST = 50  # more numbers are refused: there would never be enough draws to learn from
+MAX_DIM = (
+    50  # more numbers are refused: there would never be enough draws to learn from
+)
 WINDOW = 1000
-ELITE = 0.1
-FEWEST = 10
+ELITE_FRACTION = 0.1
+MIN_ELITE = 10
 """Where fewer draws failed, those with the largest objectives stand in for failures: a
 tenth of them, ten at least.
 """
 
-ROUNDS = 8
-EVEN = 12**-0.5
-PRIOR = 3.0
+N_FIT_ROUNDS = 8
+UNIFORM_DEVIATION = 12**-0.5
+PRIOR_COUNT = 3.0
 """Deviation of the even distribution in shares of a range; it counts for so many draws
 of each component, so that what does not matter stays wide.
 """
 
-NARROWEST = 0.02  # deviations of a number, in shares of its range, at least and at most
-FLAT = 10.0
-TELLING = 0.5
+MIN_DEVIATION = (
+    0.02  # deviations of a number, in shares of its range, at least and at most
+)
+MAX_DEVIATION = 10.0
+DISTINCTIVE_FRACTION = 0.5
 """A number tells a component apart where its deviation is under so much of the even
 one's; an option, where it has more than so much of the probability.
 """
@@ -129,16 +133,13 @@ class Components:
         offset = ranges.compute_offset(x[:, None], self.means)
         shift = torch.einsum("kn,nkd->kd", portion, offset)
         spread = torch.einsum("kn,nkd->kd", portion, (offset - shift).square())
-        component_counts = counts[:, None]
         means, deviations = self._divide_out_prior(
-            shift, spread, component_counts, ranges
+            shift, spread, counts[:, None], ranges
         )
-        one_hot_option = torch.nn.functional.one_hot(
-            (x * ranges.n_options).long().clamp(max=even.shape[2] - 1), even.shape[2]
-        )
-        frequency = torch.einsum("kn,ndo->kdo", portion, one_hot_option.double())
-        option_counts = component_counts[..., None]
-        options = (option_counts * frequency + PRIOR * even) / (option_counts + PRIOR)
+        max_options = even.shape[2]
+        option = (x * ranges.n_options).long().clamp(max=max_options - 1)
+        is_option = torch.nn.functional.one_hot(option, max_options).double()
+        options = _estimate_options(portion, is_option, counts, even)
         fraction = counts / counts.sum()
         new_weights = 0.75 * fraction + 0.25 / len(fraction)
         return Components(new_weights, means, deviations, options)
@@ -154,17 +155,36 @@ class Components:
             counts: (k, 1) samples of each component.
             ranges: of the elements.
         """
-        variance = ((counts * spread + PRIOR * EVEN**2) / (counts + PRIOR)).clamp(
-            max=0.999 * EVEN**2
-        )
-        precision = 1.0 / variance - 1.0 / EVEN**2
-        deviations = (1.0 / precision).sqrt().clamp(NARROWEST, FLAT)
+        variance = (
+            (counts * spread + PRIOR_COUNT * UNIFORM_DEVIATION**2)
+            / (counts + PRIOR_COUNT)
+        ).clamp(max=0.999 * UNIFORM_DEVIATION**2)
+        precision = 1.0 / variance - 1.0 / UNIFORM_DEVIATION**2
+        deviations = (1.0 / precision).sqrt().clamp(MIN_DEVIATION, MAX_DEVIATION)
         means = self.means + shift
-        tilted = deviations.square() * (means / variance - 0.5 / EVEN**2)
+        tilted = deviations.square() * (means / variance - 0.5 / UNIFORM_DEVIATION**2)
         means = torch.where(
             ranges.is_periodic, torch.remainder(means, 1.0), tilted.clamp(0.0, 1.0)
         )
         return means, deviations
+
+
+def _estimate_options(
+    portion: Tensor, is_option: Tensor, counts: Tensor, even: Tensor
+) -> Tensor:
+    """Return the probabilities of options (k, d, most options), with the even prior.
+
+    Args:
+        portion: (k, n) of each sample in each component.
+        is_option: (n, d, most options) float64, 1 for the option of a sample, else 0.
+        counts: (k,) samples of each component.
+        even: (k, d, most options) uniform probabilities.
+    """
+    frequency = torch.einsum("kn,ndo->kdo", portion, is_option)
+    option_counts = counts[:, None][..., None]
+    return (option_counts * frequency + PRIOR_COUNT * even) / (
+        option_counts + PRIOR_COUNT
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +252,7 @@ class MixtureState:
     ) -> tuple[float, float] | None:
         """Return the range of the most probable option; None if it is not distinct."""
         option = int(probabilities.argmax())
-        if not float(probabilities[option]) > TELLING:
+        if not float(probabilities[option]) > DISTINCTIVE_FRACTION:
             return None
         return option / n_options, (option + 1) / n_options
 
@@ -243,7 +263,7 @@ class MixtureState:
         """Return the range of a number; None if it is wide, or goes through 0."""
         reach = 2.0 * deviation
         crosses_zero = is_periodic and (mean - reach < 0.0 or mean + reach > 1.0)
-        if crosses_zero or not reach < 2.0 * TELLING * EVEN:
+        if crosses_zero or not reach < 2.0 * DISTINCTIVE_FRACTION * UNIFORM_DEVIATION:
             return None
         return max(0.0, mean - reach), min(1.0, mean + reach)
 
@@ -297,9 +317,9 @@ class Mixture(Policy[MixtureState]):
     def start(
         self, domain: policies.Domain, generator: torch.Generator, steps: int
     ) -> MixtureState:
-        if domain.dim > MOST:
+        if domain.dim > MAX_DIM:
             raise InputError(
-                f"policy 'mixture': expected at most {MOST} numbers, got "
+                f"policy 'mixture': expected at most {MAX_DIM} numbers, got "
                 f"{domain.dim}; use pgd or auto"
             )
         ranges = Ranges(domain.options, policies.find_periodic(domain))
@@ -322,7 +342,7 @@ class Mixture(Policy[MixtureState]):
     ) -> MixtureState:
         points = state.points[state.n_evaluated :][: len(evaluated)]
         mixture = state.mixtures[-1]
-        with policies.use_one_thread():
+        with policies.limit_to_single_thread():
             weights = (1.0 / self._density(mixture, points, state.ranges)).tolist()
         max_weight = 1.0 if mixture is None else 1.0 / self.even
         rows = [
@@ -347,7 +367,7 @@ class Mixture(Policy[MixtureState]):
 
     def failures(self, state: MixtureState) -> policies.Failures:
         """Return a failure for each component that has some, and the failure rate."""
-        with policies.use_one_thread():
+        with policies.limit_to_single_thread():
             failure_rate = policies.estimate_failure_rate(
                 state.log[:, 3],
                 state.log[:, 4],
@@ -447,7 +467,7 @@ class Mixture(Policy[MixtureState]):
         points = state.evaluated_points[is_elite]
         if not len(points):
             return None
-        with policies.use_one_thread():
+        with policies.limit_to_single_thread():
             densities = [
                 self._density(mixture, points, ranges) for mixture in state.mixtures
             ]
@@ -466,10 +486,10 @@ class Mixture(Policy[MixtureState]):
             mixture = Components(
                 torch.full((len(means),), 1.0 / len(means), dtype=torch.float64),
                 means,
-                torch.full_like(means, 0.5 * EVEN),
+                torch.full_like(means, 0.5 * UNIFORM_DEVIATION),
                 even,
             )
-            for _ in range(ROUNDS):
+            for _ in range(N_FIT_ROUNDS):
                 mixture = mixture.maximize(points, weights, ranges, even)
         return mixture
 
@@ -481,8 +501,8 @@ class Mixture(Policy[MixtureState]):
         """
         is_known = ~log[:, 2].bool()
         is_elite = is_known & log[:, 1].bool()
-        if int(is_elite.sum()) < FEWEST:
-            n_elite = max(FEWEST, math.ceil(ELITE * len(log)))
+        if int(is_elite.sum()) < MIN_ELITE:
+            n_elite = max(MIN_ELITE, math.ceil(ELITE_FRACTION * len(log)))
             n_elite = min(int(is_known.sum()), n_elite)
             objectives = torch.where(is_known, log[:, 0], -math.inf)
             is_elite[objectives.topk(n_elite).indices] = True

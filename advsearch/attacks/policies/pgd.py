@@ -31,16 +31,16 @@ MEMORY = 15  # latest gradients whose lengths say what is usual
 # the same of numbers in an l2 block, whose true gradient may be uneven: its direction
 # is at stake
 CLIP_L2 = 10.0
-FEWEST_NUMBERS = 8  # fewer numbers than this have no median to speak of
+MIN_CLIPPED_SIZE = 8  # fewer numbers than this have no median to speak of
 
 
-def clipped(
+def clip_gradient(
     domain: Domain, gradient: Tensor, lengths: tuple[float, ...]
 ) -> tuple[Tensor, tuple[float, ...], Counts]:
     """Return a gradient (d,), finite, without outliers, the lengths of the latest ones,
     and what was an outlier.
 
-    - In a ball of at least `FEWEST_NUMBERS`, each is cut to so many medians of those
+    - In a ball of at least `MIN_CLIPPED_SIZE`, each is cut to so many medians of those
       that are not zero: `CLIP` in an l-infinity ball, where the step follows the signs,
       so that this changes how gradients are averaged and no single step; `CLIP_L2` in
       an l2 ball.
@@ -50,53 +50,60 @@ def clipped(
     """
     if domain.exact or domain.draws_conditions:
         return gradient, lengths, NO_COUNTS
-    out = gradient.clone()
-    cut = False
+    clipped_gradient = gradient.clone()
+    has_outliers = False
     for block, part in domain.list_block_slices():
         if (
             block.norm != "box"
-            and block.size >= FEWEST_NUMBERS
-            and bool(out[part].any())
+            and block.size >= MIN_CLIPPED_SIZE
+            and bool(clipped_gradient[part].any())
         ):
-            sizes = out[part].abs()
+            magnitudes = clipped_gradient[part].abs()
             limit = (CLIP if block.norm == "linf" else CLIP_L2) * float(
-                sizes[sizes > 0].median()
+                magnitudes[magnitudes > 0].median()
             )
-            if float(sizes.amax()) > limit:
-                cut, out[part] = True, out[part].clamp(-limit, limit)
-    length = float(torch.linalg.vector_norm(out))
+            if float(magnitudes.amax()) > limit:
+                has_outliers = True
+                clipped_gradient[part] = clipped_gradient[part].clamp(-limit, limit)
+    length = float(torch.linalg.vector_norm(clipped_gradient))
     lengths = (*lengths, length)[-MEMORY:]
-    usual = sorted(lengths)[len(lengths) // 2]
-    shortened = length > CLIP * usual > 0.0
+    median_length = sorted(lengths)[len(lengths) // 2]
+    shortened = length > CLIP * median_length > 0.0
     return (
-        out * (CLIP * usual / length) if shortened else out,
+        clipped_gradient * (CLIP * median_length / length)
+        if shortened
+        else clipped_gradient,
         lengths,
-        Counts(int(cut), int(shortened)),
+        Counts(int(has_outliers), int(shortened)),
     )
 
 
 FIRST_WINDOW = 0.22
-SHORTEN = 0.03
-SHORTEST = 0.06
+WINDOW_DECREASE = 0.03
+MIN_WINDOW_FRACTION = 0.06
 """Length of the first window, how much each next one is shorter, and the shortest, as
 fractions of the steps.
 """
 
-FEWEST = 3  # no window is shorter than this: two noisy values say nothing about a trend
+MIN_WINDOW = (
+    3  # no window is shorter than this: two noisy values say nothing about a trend
+)
 # fraction of a window's steps that must improve the objective to keep the step size
 # (Auto-PGD's rho)
-IMPROVING = 0.75
+MIN_IMPROVING_FRACTION = 0.75
 # what is left of the step size at the end of a search without noise, as a fraction of
 # the first
-SLOWEST = 0.05
-# the same as `FEWEST` without noise, where all windows have the shortest length
-FEWEST_EXACT = 5
+FINAL_STEP_FRACTION = 0.05
+# the same as `MIN_WINDOW` without noise, where all windows have the shortest length
+MIN_WINDOW_EXACT = 5
 # without noise, what a window must add to the best of the one before, as a fraction of
 # all that was gained
-GAIN = 1e-3
-ENOUGH = 3  # windows in a row that add less, after which there is nothing to gain
+MIN_WINDOW_GAIN = 1e-3
+MAX_IDLE_WINDOWS = (
+    3  # windows in a row that add less, after which there is nothing to gain
+)
 # evaluations in a row without any gradient after which there is nothing to follow
-PATIENCE = 5
+MAX_FLAT_GRADIENTS = 5
 
 
 class Peak(NamedTuple):
@@ -135,7 +142,7 @@ class Window:
         objective, or the best has not moved since the last checkpoint although the step
         size was kept there (conditions 1 and 2 of Auto-PGD).
         """
-        return self.improved < IMPROVING * len(self.values) or (
+        return self.improved < MIN_IMPROVING_FRACTION * len(self.values) or (
             not self.halved and best <= self.best
         )
 
@@ -151,14 +158,14 @@ class Window:
 
     def next(self, steps: int, best: float, halved: bool) -> Window:
         length = max(
-            FEWEST,
-            round(SHORTEST * steps),
-            self.length - max(1, round(SHORTEN * steps)),
+            MIN_WINDOW,
+            round(MIN_WINDOW_FRACTION * steps),
+            self.length - max(1, round(WINDOW_DECREASE * steps)),
         )
         return Window(length, (), self.values[-1], 0, best, halved)
 
 
-NOTHING = torch.zeros(())
+NO_SQUARES = torch.zeros(())
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +173,7 @@ class Ascent:
     """Where an ascent of so many evaluations stands: u (d,) to propose next, the
     accumulated gradient (d,), of Adam its mean and the mean (d,) of squares, the step
     size, the best evaluation, evaluations so far (`count`), gradients in these means
-    (`n_steps_taken`), zero gradients in a row (`flat`), and lengths of gradients as `clipped`
+    (`n_updates`), zero gradients in a row (`flat`), and lengths of gradients as `clip_gradient`
     wants them. PGD has besides the objective at the start, a window, and windows in a
     row that added nothing (`idle`, without noise only).
     """
@@ -177,20 +184,20 @@ class Ascent:
     u: Tensor
     direction: Tensor
     step_size: float
-    square: Tensor = NOTHING
+    square: Tensor = NO_SQUARES
     peak: Peak | None = None
     count: int = 0
-    n_steps_taken: int = 0
+    n_updates: int = 0
     flat: int = 0
     lengths: tuple[float, ...] = ()
     counts: Counts = NO_COUNTS
-    window: Window = field(default_factory=lambda: Window(FEWEST))
+    window: Window = field(default_factory=lambda: Window(MIN_WINDOW))
     first: float = math.nan
     idle: int = 0
 
-    def falling(self, number: int) -> float:
+    def decay_step_size(self, number: int) -> float:
         """Return the step size of evaluation `number` where it falls in a line."""
-        return self.step_size * max(SLOWEST, 1.0 - number / self.steps)
+        return self.step_size * max(FINAL_STEP_FRACTION, 1.0 - number / self.steps)
 
 
 class AscentPolicy(Policy[Ascent]):
@@ -199,7 +206,7 @@ class AscentPolicy(Policy[Ascent]):
     uses_gradient: ClassVar[bool] = True
 
     def propose(self, state: Ascent, n: int) -> tuple[tuple[Proposal, ...], Ascent]:
-        if state.flat >= PATIENCE or state.idle >= ENOUGH:
+        if state.flat >= MAX_FLAT_GRADIENTS or state.idle >= MAX_IDLE_WINDOWS:
             return (), state
         return (Proposal(state.u, gradient=True, step_size=self.pace(state)),), state
 
@@ -213,7 +220,7 @@ class AscentPolicy(Policy[Ascent]):
             )
         # without one nothing is known: go on as before
         if evaluation.gradient is not None:
-            gradient, lengths, outliers = clipped(
+            gradient, lengths, outliers = clip_gradient(
                 state.domain, evaluation.gradient, state.lengths
             )
             state = replace(
@@ -225,7 +232,7 @@ class AscentPolicy(Policy[Ascent]):
             if bool(gradient.any()):
                 state = replace(
                     self.learn(state, gradient),
-                    n_steps_taken=state.n_steps_taken + 1,
+                    n_updates=state.n_updates + 1,
                     flat=0,
                 )
         if state.peak is None or evaluation.objective > state.peak.objective:
@@ -255,7 +262,7 @@ class AscentPolicy(Policy[Ascent]):
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
         """Return the state with the next configuration, after u with its objective."""
 
-    def refused(self, field: str, expected: str, example: float) -> InputError:
+    def make_range_error(self, field: str, expected: str, example: float) -> InputError:
         return InputError(
             f"{field}: expected a number in {expected}, got "
             f"{getattr(self, field)}; try {example}"
@@ -273,7 +280,7 @@ class PGD(AscentPolicy):
         m <- momentum * m + g / mean|g|                (MI-FGSM, Dong et al. 2018, eq. 6)
         u <- P(u + step_size * steepest(m))
 
-    g is clipped first (see `clipped`). Accumulating gradients before the sign is taken
+    g is clipped first (see `clip_gradient`). Accumulating gradients before the sign is taken
     matters here: each comes from another seed, and the sign of one noisy gradient is a
     coin toss wherever the noise exceeds it.
 
@@ -286,15 +293,15 @@ class PGD(AscentPolicy):
     In a domain without noise (`Domain.exact`) no gradient is clipped, and the step size
     falls in a line over the planned steps, which came farther than Auto-PGD's rule at
     every budget that was tried (docs/policies/pgd.md). It is halved besides after a
-    window that added less than `GAIN` of what the search has gained; after `ENOUGH` of
-    these in a row there is nothing more to propose. In one whose evaluations draw
-    conditions from a bank (`Domain.drawn`) the step size falls likewise, and no window
-    is looked at: what one gained says what it drew.
+    window that added less than `MIN_WINDOW_GAIN` of what the search has gained; after
+    `MAX_IDLE_WINDOWS` of these in a row there is nothing more to propose. Where
+    evaluations sample conditions (`Domain.draws_conditions`) the step size falls
+    likewise, and windows are ignored: what one gained depends on its conditions.
 
     An evaluation with the objective -inf sends the search back to its best
     configuration, which is evaluated again and left with half the step size. A gradient
     of zero leaves the accumulated one in charge; if that is zero too, the step goes in
-    a random direction; and after `PATIENCE` zero gradients in a row there is nothing
+    a random direction; and after `MAX_FLAT_GRADIENTS` zero gradients in a row there is nothing
     more to propose.
 
     Attributes:
@@ -313,32 +320,36 @@ class PGD(AscentPolicy):
 
     def __post_init__(self) -> None:
         if not 0.0 < self.step_size <= 2.0:
-            raise self.refused("step_size", "(0, 2], a fraction of epsilon", 0.5)
+            raise self.make_range_error(
+                "step_size", "(0, 2], a fraction of epsilon", 0.5
+            )
         if not 0.0 <= self.momentum < 1.0:
-            raise self.refused("momentum", "[0, 1)", 0.5)
+            raise self.make_range_error("momentum", "[0, 1)", 0.5)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
         seed = draw_seed(generator)
         u = domain.sample(seeded(seed, 0))[0] if self.random_start else domain.begin
         steps = max(1, steps // (1 + domain.gradient_cost))
-        fewest, share = (
-            (FEWEST_EXACT, SHORTEST) if domain.exact else (FEWEST, FIRST_WINDOW)
+        min_length, window_fraction = (
+            (MIN_WINDOW_EXACT, MIN_WINDOW_FRACTION)
+            if domain.exact
+            else (MIN_WINDOW, FIRST_WINDOW)
         )
-        window = Window(max(fewest, round(share * steps)))
+        window = Window(max(min_length, round(window_fraction * steps)))
         return Ascent(
             domain, steps, seed, u, torch.zeros_like(u), self.step_size, window=window
         )
 
     def pace(self, state: Ascent) -> float:
         return (
-            state.falling(state.count)
+            state.decay_step_size(state.count)
             if state.domain.exact or state.domain.draws_conditions
             else state.step_size
         )
 
     def retreat(self, state: Ascent) -> Ascent:
         if state.peak is None:
-            return self._moved(
+            return self._move_uphill(
                 replace(state, direction=torch.zeros_like(state.u)), state.domain.begin
             )
         return replace(state, u=state.peak.u, direction=state.peak.direction)
@@ -355,20 +366,20 @@ class PGD(AscentPolicy):
         if math.isnan(state.first):
             state = replace(state, first=objective)
         if state.domain.draws_conditions:
-            return self._moved(state, u)
+            return self._move_uphill(state, u)
         window = state.window.add(objective)
         peak = state.peak
         slower = replace(state, step_size=state.step_size / 2)
         if len(window.values) < window.length:
-            return self._moved(replace(state, window=window), u)
+            return self._move_uphill(replace(state, window=window), u)
         # (the best of all may stem from another matrix of light transport)
         if state.domain.exact:
             best = max(window.values)
-            idle = best - window.best <= GAIN * (best - state.first)
+            idle = best - window.best <= MIN_WINDOW_GAIN * (best - state.first)
             state = (
                 replace(slower, idle=state.idle + 1) if idle else replace(state, idle=0)
             )
-            return self._moved(
+            return self._move_uphill(
                 replace(state, window=Window(window.length, best=best)), u
             )
         best = peak.objective if peak else -math.inf
@@ -381,11 +392,11 @@ class PGD(AscentPolicy):
                 direction=peak.direction,
                 counts=state.counts + Counts(rejected=1),
             )
-        return self._moved(
+        return self._move_uphill(
             replace(state, window=window.next(state.steps, best, stalled)), u
         )
 
-    def _moved(self, state: Ascent, u: Tensor) -> Ascent:
+    def _move_uphill(self, state: Ascent, u: Tensor) -> Ascent:
         """Move from u along the accumulated gradient, or at random where there is
         none.
         """
@@ -412,7 +423,7 @@ class Adam(AscentPolicy):
     mean over the block, since there the best step for a constant gradient is along it
     and not along its signs.
 
-    g is clipped first (see `pgd.clipped`). An evaluation without a gradient goes on
+    g is clipped first (see `pgd.clip_gradient`). An evaluation without a gradient goes on
     along m. One whose objective could not be computed sends the search back to its best
     configuration, with m = v = 0 and half the rate. While there is no gradient but zero
     the step is random; after five zero gradients in a row there is nothing more to
@@ -431,10 +442,12 @@ class Adam(AscentPolicy):
 
     def __post_init__(self) -> None:
         if not 0.0 < self.step_size <= 2.0:
-            raise self.refused("step_size", "(0, 2], a share of half the range", 0.3)
+            raise self.make_range_error(
+                "step_size", "(0, 2], a share of half the range", 0.3
+            )
         for beta in ("beta1", "beta2"):
             if not 0.0 <= getattr(self, beta) < 1.0:
-                raise self.refused(beta, "[0, 1)", 0.9)
+                raise self.make_range_error(beta, "[0, 1)", 0.9)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
         steps = max(1, steps // (1 + domain.gradient_cost))
@@ -444,12 +457,12 @@ class Adam(AscentPolicy):
         )
 
     def pace(self, state: Ascent) -> float:
-        return state.falling(state.count)
+        return state.decay_step_size(state.count)
 
     def retreat(self, state: Ascent) -> Ascent:
         u = state.domain.begin if state.peak is None else state.peak.u
         return replace(
-            state, u=u, direction=torch.zeros_like(u), square=NOTHING, n_steps_taken=0
+            state, u=u, direction=torch.zeros_like(u), square=NO_SQUARES, n_updates=0
         )
 
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
@@ -463,20 +476,22 @@ class Adam(AscentPolicy):
         )
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
-        if state.n_steps_taken:
-            mean = state.direction / (1.0 - self.beta1**state.n_steps_taken)
-            way = mean / (
-                state.square / (1.0 - self.beta2**state.n_steps_taken)
+        if state.n_updates:
+            mean = state.direction / (1.0 - self.beta1**state.n_updates)
+            direction = mean / (
+                state.square / (1.0 - self.beta2**state.n_updates)
             ).sqrt_().clamp_(min=1e-30)
         else:  # at random as long as nothing is known
-            way = torch.randn(
+            direction = torch.randn(
                 u.numel(), generator=seeded(state.seed, state.count)
             ).sign_()
         # of the evaluation that this step follows
-        rate = state.falling(state.count - 1)
+        rate = state.decay_step_size(state.count - 1)
         return replace(
             state,
             u=state.domain.project(
-                torch.addcmul(u, compute_half_widths(state.domain), way, value=rate)
+                torch.addcmul(
+                    u, compute_half_widths(state.domain), direction, value=rate
+                )
             ),
         )

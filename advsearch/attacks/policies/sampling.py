@@ -6,7 +6,7 @@ the renders allow.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -17,13 +17,15 @@ from advsearch.attacks.domain import Block, Domain, option_center
 from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.errors import InputError
 
-MOST = 21_201  # Scipy has direction numbers for so many dimensions (Joe and Kuo 2008)
+MAX_SOBOL_DIM = (
+    21_201  # Scipy has direction numbers for so many dimensions (Joe and Kuo 2008)
+)
 # numbers of a Sobol sequence that are drawn and kept at once, at most, and one point at
 # least
-CHUNK = 2**20
+MAX_CHUNK_NUMBERS = 2**20
 
 
-NONE = torch.empty(0, 0)
+NO_POINTS = torch.empty(0, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +37,7 @@ class PointsState:
 
     domain: Domain
     seed: int = 0
-    points: Tensor = NONE
+    points: Tensor = NO_POINTS
     n_proposed: int = 0
 
     def propose(self, us: Iterable[Tensor]) -> tuple[tuple[Proposal, ...], PointsState]:
@@ -104,15 +106,15 @@ class Sobol(NonAdaptivePolicy):
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> PointsState:
         size = domain.dim + sum(block.norm == "l2" for block in domain.blocks)
-        if size > MOST:
+        if size > MAX_SOBOL_DIM:
             raise InputError(
-                f"policy 'sobol': expected at most {MOST} dimensions, got {size}; use "
+                f"policy 'sobol': expected at most {MAX_SOBOL_DIM} dimensions, got {size}; use "
                 "policy random, nes, pgd or auto"
             )
         seed = draw_seed(generator)
-        most = max(1, CHUNK // size)
+        most = max(1, MAX_CHUNK_NUMBERS // size)
         count = 2 ** max(0, min(steps - 1, most - 1).bit_length())
-        return PointsState(domain, seed, sample_points(size, seed, 0, count))
+        return PointsState(domain, seed, sample_sobol_points(size, seed, 0, count))
 
     def propose(
         self, state: PointsState, n: int
@@ -120,7 +122,8 @@ class Sobol(NonAdaptivePolicy):
         count, size = state.points.shape
         if state.n_proposed and state.n_proposed % count == 0:
             state = replace(
-                state, points=sample_points(size, state.seed, state.n_proposed, count)
+                state,
+                points=sample_sobol_points(size, state.seed, state.n_proposed, count),
             )
         return state.propose(
             to_domain(state.domain, x)
@@ -128,7 +131,7 @@ class Sobol(NonAdaptivePolicy):
         )
 
 
-def sample_points(size: int, seed: int, begin: int, count: int) -> Tensor:
+def sample_sobol_points(size: int, seed: int, begin: int, count: int) -> Tensor:
     """Return `count` points of the scrambled sequence of that seed from number `begin`
     on: (count, size) float32. The first call takes a power of two, which is what keeps
     the points balanced.
@@ -190,33 +193,10 @@ class Grid(NonAdaptivePolicy):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> PointsState:
-        counts = _counts(domain, steps, self.points)
-        low = domain.lower.clone()
-        high = domain.upper.clone()
-        for block, part in domain.list_block_slices():
-            # the cube around the ball
-            if block.norm == "l2" and block.epsilon is not None:
-                low[part] = low[part].maximum(domain.start[part] - block.epsilon)
-                high[part] = high[part].minimum(domain.start[part] + block.epsilon)
-        blocks = [block for block in domain.blocks for _ in range(block.size)]
-        axes = []
-        for block, count, least, most in zip(
-            blocks, counts, low.tolist(), high.tolist(), strict=True
-        ):
-            if block.options:
-                axes.append((torch.arange(count) + 0.5) / count)
-            elif block.periodic:  # its end is its beginning and comes once
-                axes.append(least + (most - least) * torch.arange(count) / count)
-            else:
-                axes.append(torch.linspace(least, most, count))
-        points = torch.cartesian_prod(*axes).reshape(-1, domain.dim)
-        # coarse to fine: by the largest, then the sum of the levels of a point, whose
-        # last axis runs fastest
-        largest = total = torch.zeros(1, dtype=torch.long)
-        for level in map(_levels, blocks, counts):
-            largest = torch.maximum(largest[:, None], level).flatten()
-            total = (total[:, None] + level).flatten()
-        order = (largest * (int(total.max()) + 1) + total).argsort(stable=True)
+        counts = _count_values(domain, steps, self.points)
+        points = torch.cartesian_prod(*_make_axes(domain, counts))
+        points = points.reshape(-1, domain.dim)
+        order = _order_coarse_to_fine(_list_blocks(domain), counts)
         return PointsState(domain, points=points[order])
 
     def propose(
@@ -230,7 +210,59 @@ class Grid(NonAdaptivePolicy):
         )
 
 
-def _counts(domain: Domain, steps: int, points: int) -> list[int]:
+def _list_blocks(domain: Domain) -> list[Block]:
+    """Return the block of each element of u."""
+    return [block for block in domain.blocks for _ in range(block.size)]
+
+
+def _make_axes(domain: Domain, counts: Sequence[int]) -> list[Tensor]:
+    """Return the values of each element of u, (count,) in rising order."""
+    lower = domain.lower.clone()
+    upper = domain.upper.clone()
+    for block, part in domain.list_block_slices():
+        # the cube around the ball
+        if block.norm == "l2" and block.epsilon is not None:
+            lower[part] = lower[part].maximum(domain.start[part] - block.epsilon)
+            upper[part] = upper[part].minimum(domain.start[part] + block.epsilon)
+    axes = []
+    for block, count, low, high in zip(
+        _list_blocks(domain), counts, lower.tolist(), upper.tolist(), strict=True
+    ):
+        if block.options:
+            axes.append((torch.arange(count) + 0.5) / count)
+        elif block.periodic:  # the upper bound is the lower one, and comes once
+            axes.append(low + (high - low) * torch.arange(count) / count)
+        else:
+            axes.append(torch.linspace(low, high, count))
+    return axes
+
+
+def _order_coarse_to_fine(blocks: Sequence[Block], counts: Sequence[int]) -> Tensor:
+    """Return the indices of all points of a grid, (n,), the coarse ones first.
+
+    They are sorted by the largest level of a point, then by the sum of its levels. The
+    last axis of the grid runs fastest.
+    """
+    max_level = torch.zeros(1, dtype=torch.long)
+    level_sum = max_level
+    for level in map(_compute_levels, blocks, counts):
+        max_level = torch.maximum(max_level[:, None], level).flatten()
+        level_sum = (level_sum[:, None] + level).flatten()
+    sort_key = max_level * (int(level_sum.max()) + 1) + level_sum
+    return sort_key.argsort(stable=True)
+
+
+def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
+    """Return how many values each element of u takes.
+
+    Args:
+        domain: to search.
+        steps: renders that the grid may take.
+        points: values of each number; 0 for as many as fit.
+
+    Raises:
+        InputError: the grid does not fit into the renders.
+    """
     options = domain.options.tolist()
     numbers = options.count(0)
     combinations = math.prod(n for n in options if n)
@@ -262,7 +294,7 @@ def _counts(domain: Domain, steps: int, points: int) -> list[int]:
     return counts
 
 
-def _levels(block: Block, count: int) -> Tensor:
+def _compute_levels(block: Block, count: int) -> Tensor:
     """Return (count,) how often an axis must be halved until a value is met: 0 for both
     ends and for every option.
     """

@@ -19,11 +19,11 @@ from advsearch.attacks.evaluation import Evaluated, seeded
 # long gone
 MAX_SOBOL_DIM = 1000
 # about so many coordinates change in one local move; all, where there are no more
-MOVED = 4
-ANOTHER = 0.3  # share of moved choices that are drawn anew
+N_MOVED_COORDINATES = 4
+RESAMPLED_FRACTION = 0.3  # share of moved choices that are drawn anew
 # deviations of local moves, in a coordinate's whole range; between them log-uniform
-NEAREST = 0.01
-FARTHEST = 0.3
+MIN_MOVE = 0.01
+MAX_MOVE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,15 +78,15 @@ class BoxCoordinates:
         moved, near or far.
         """
         n, k = x.shape
-        far = math.log(FARTHEST / NEAREST)
-        size = NEAREST * torch.exp(far * torch.rand(n, 1, generator=generator))
-        moved = torch.rand(n, k, generator=generator) < MOVED / k
+        far = math.log(MAX_MOVE / MIN_MOVE)
+        size = MIN_MOVE * torch.exp(far * torch.rand(n, 1, generator=generator))
+        moved = torch.rand(n, k, generator=generator) < N_MOVED_COORDINATES / k
         moved[torch.arange(n), torch.randint(k, (n,), generator=generator)] = True
         near = x + moved * size * torch.randn(n, k, generator=generator)
         anew = (
             moved
             & (self.options > 0)
-            & (torch.rand(n, k, generator=generator) < ANOTHER)
+            & (torch.rand(n, k, generator=generator) < RESAMPLED_FRACTION)
         )
         x = torch.where(self.options > 0, x, near)
         return self.normalize(
@@ -144,13 +144,13 @@ NOISES = (1e-4, 1e-2, 0.1, 0.5, 2.0)
 STRETCHES = (0.5, 2.0, 4.0)  # by how much one coordinate's length is changed on trial
 # no length is more than this many times the root of the number of coordinates: it no
 # longer matters then
-LONGEST = 8.0
+MAX_LENGTH = 8.0
 # gain in log-likelihood that a coordinate's own length must bring; less would fit the
 # noise
-EVIDENCE = 1.0
+MIN_LIKELIHOOD_GAIN = 1.0
 # lengths and noise are fitted again after so many new points, or a tenth of all if that
 # is more
-REFIT = 5
+REFIT_INTERVAL = 5
 # so many of the best points and so many of the latest count, unless more are asked for
 MEMORY = 100
 MAX_SCALED_DIM = (
@@ -242,16 +242,16 @@ class Observations:
         values = torch.where(finite, values, values[finite].min())
         scales = self.scales
         fitted = self.fitted
-        if scales is None or n - fitted >= max(REFIT, fitted // 10):
-            used = _best_and_latest(values, MEMORY)
-            scales = _best_scales(self.space, self.points[used], values[used])
+        if scales is None or n - fitted >= max(REFIT_INTERVAL, fitted // 10):
+            used = _select_best_and_latest(values, MEMORY)
+            scales = _find_best_scales(self.space, self.points[used], values[used])
             fitted = n
-        used = _best_and_latest(values, self.memory)
+        used = _select_best_and_latest(values, self.memory)
         surrogate = fit(self.space, self.points[used], values[used], scales)
         return surrogate, replace(self, scales=scales, fitted=fitted)
 
 
-def _best_and_latest(values: Tensor, memory: int) -> Tensor:
+def _select_best_and_latest(values: Tensor, memory: int) -> Tensor:
     """Return places of so many of the largest values and so many of the last; of all if
     there are no more.
     """
@@ -274,7 +274,7 @@ def fit(
     """Return the process given values (n,) at points (n, k), mean and variance at their
     best; the scales too are fitted unless they are given.
     """
-    scales = scales or _best_scales(space, x, y)
+    scales = scales or _find_best_scales(space, x, y)
     points = space.embed(x, scales.lengths)
     n = len(x)
     matrix = kernel(points, points) + (scales.noise + 1e-8) * torch.eye(
@@ -291,7 +291,7 @@ def fit(
     return Surrogate(space, x, scales, factor, weights, mean, variance, likelihood)
 
 
-def _best_scales(space: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
+def _find_best_scales(space: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
     """The most likely common length and noise, then length by length what the evidence
     asks for.
     """
@@ -315,9 +315,9 @@ def _best_scales(space: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
         changed = []
         for stretch in STRETCHES:
             lengths = best.scales.lengths.clone()
-            lengths[j] = min(unit * LONGEST, float(lengths[j]) * stretch)
+            lengths[j] = min(unit * MAX_LENGTH, float(lengths[j]) * stretch)
             changed.append(Scales(lengths, best.scales.noise))
         other = most_likely(changed)
-        if other.likelihood > best.likelihood + EVIDENCE:
+        if other.likelihood > best.likelihood + MIN_LIKELIHOOD_GAIN:
             best = other
     return best.scales

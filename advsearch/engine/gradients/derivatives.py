@@ -151,7 +151,10 @@ def compare_with_reference(
         status = "noisy" if estimate.noise > MAX_NOISE * size else "ok"
 
     def relative(value: float) -> float:
-        return value / size if size > 0.0 else math.inf if value else 0.0
+        """Return a value in units of the size."""
+        if size > 0.0:
+            return value / size
+        return math.inf if value else 0.0
 
     return Measured(
         quantity="derivative",
@@ -211,7 +214,7 @@ def find_probes(bench: Bench) -> list[Probe]:
         if group.size > MAX_SINGLE_PROBES:
             step = group.step if group.size <= 64 else 0.03
             probes.append(
-                Probe(group, group.name, _mixed_direction(bench, group), step)
+                Probe(group, group.name, _make_mixed_direction(bench, group), step)
             )
             continue
         for number in range(group.size):
@@ -222,7 +225,7 @@ def find_probes(bench: Bench) -> list[Probe]:
     return probes
 
 
-def _mixed_direction(bench: Bench, group: Group) -> Tensor:
+def _make_mixed_direction(bench: Bench, group: Group) -> Tensor:
     """Return a direction (d,) in a group: mostly the signs of the estimator's own
     gradient, so that there is something to see, and a share of random signs, so that
     what the estimator leaves out shows too.
@@ -253,10 +256,10 @@ def measure_reference(
     """Return the derivative along a probe by central differences at two steps, with its
     noise.
 
-    Seeds are added until the standard error is below `MAX_REFERENCE_ERROR` of the value, between the
-    two numbers of `repeats`. With several `factors`, each gets the smaller number of
-    seeds, both steps so many times wider, until one is sure enough; if none is, the one
-    with the least noise goes on.
+    Seeds are added until the standard error is below `MAX_REFERENCE_ERROR` of the
+    value, between the two numbers of `repeats`. With several `factors`, each gets the
+    smaller number of seeds, both steps so many times wider, until one is sure enough;
+    if none is, the one with the least noise goes on.
     """
     pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
 
@@ -269,8 +272,8 @@ def measure_reference(
             noise = seeds.stream(bench.seed, "reference", number)
             pairs[factor].append(
                 (
-                    _difference(bench, probe, step, noise),
-                    _difference(bench, probe, 0.5 * step, noise),
+                    _compute_difference(bench, probe, step, noise),
+                    _compute_difference(bench, probe, 0.5 * step, noise),
                 )
             )
         extrapolated = [(4.0 * fine - coarse) / 3.0 for coarse, fine in pairs[factor]]
@@ -303,7 +306,7 @@ def measure_reference(
     return reference
 
 
-def _difference(bench: Bench, probe: Probe, step: float, seed: int) -> float:
+def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> float:
     """Return one central difference of the loss along a probe, with one seed on both
     sides.
     """

@@ -175,9 +175,8 @@ def _score_estimators(
     noise_of = dict[str, float]()
     for estimator in estimators:
         single_plan = restrict_plan(plan, group_names, estimator)
-        label = f"{groups[0].name} by {estimator}"
         gradients, seconds = bench.compute_gradients(
-            single_plan, "plan", repeats, label
+            single_plan, "plan", repeats, f"{groups[0].name} by {estimator}"
         )
         if counted:
             adjoint_renders = (
@@ -188,18 +187,32 @@ def _score_estimators(
         gradients_of[estimator] = gradients
         seconds_of[estimator] = seconds
         noise_of[estimator] = float(deviation.square().sum() / max(1, repeats - 1))
-    reference = next(name for name in estimators if name in DIFFERENCE_ESTIMATORS)
+    errors = _compute_squared_errors(gradients_of, noise_of, repeats)
+    return {name: error * seconds_of[name] for name, error in errors.items()}
+
+
+def _compute_squared_errors(
+    gradients_of: Mapping[str, Tensor], noise_of: Mapping[str, float], repeats: int
+) -> dict[str, float]:
+    """Return the mean squared error of each estimator, at least its own noise.
+
+    Args:
+        gradients_of: (repeats, d) of each estimator; one of them takes differences.
+        noise_of: variance of each, summed over the elements.
+        repeats: gradients of each.
+    """
+    reference = next(name for name in gradients_of if name in DIFFERENCE_ESTIMATORS)
     reference_gradient = gradients_of[reference].mean(dim=0)
-    scores = dict[str, float]()
+    reference_noise = noise_of[reference]
+    errors = dict[str, float]()
     for estimator, gradients in gradients_of.items():
         squared_distance = (gradients - reference_gradient).square().sum(dim=1).mean()
-        error = float(squared_distance) - noise_of[reference] / repeats
+        error = float(squared_distance) - reference_noise / repeats
         if estimator == reference:
-            error = noise_of[reference]
+            errors[estimator] = reference_noise
         else:
-            error = max(error, noise_of[estimator])
-        scores[estimator] = error * seconds_of[estimator]
-    return scores
+            errors[estimator] = max(error, noise_of[estimator])
+    return errors
 
 
 def _explain_scores(

@@ -10,7 +10,7 @@ import inspect
 import sys
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import permutations
 from typing import Any
@@ -282,9 +282,9 @@ class _LanguageModel(nn.Module):
         """
         tokenizer = self.processor.tokenizer
         prompt = self.get_prompt(self.image_size)["input_ids"][0].tolist()
-        ends_in_space = self.text[-1:].isspace()
-        ends_in_special = prompt[-1] in tokenizer.all_special_ids
-        gap = "" if ends_in_space or ends_in_special else " "
+        gap = " "
+        if self.text[-1:].isspace() or prompt[-1] in tokenizer.all_special_ids:
+            gap = ""
         text_tokens = tokenizer(self.text, verbose=False)["input_ids"]
         words = get_spoken_names(names)
         # Whether the processor adds tokens before the text only, and none behind it.
@@ -436,7 +436,10 @@ def _find_stems(tokens: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
 
 
 class _FreeAnswerer(nn.Module):
-    """Answer freely about each image, `advsearch.tasks.answers.AnswerWithLogits`: greedy decoding."""
+    """Answer freely about each image, by greedy decoding.
+
+    The outputs are `advsearch.tasks.answers.AnswerWithLogits`.
+    """
 
     def __init__(self, reader: _LanguageModel, most: int) -> None:
         super().__init__()
@@ -483,6 +486,21 @@ class _FreeAnswerer(nn.Module):
         return sorted(first_tokens - {self.tokenizer.unk_token_id})
 
 
+def _append_tokens(prompt: Mapping[str, Tensor], tokens: Tensor) -> dict[str, Tensor]:
+    """Return the inputs of a network for a prompt that tokens (n,) follow."""
+    inputs = dict(prompt)
+    inputs["input_ids"] = torch.cat([prompt["input_ids"], tokens[None]], dim=1)
+    for key in ("attention_mask", "mm_token_type_ids", "token_type_ids"):
+        if key in prompt:
+            # In most networks type 1 is the image, but in PaliGemma, which marks
+            # nothing before, it is the answer.
+            is_answer = key == "token_type_ids" and not prompt[key].any()
+            value = 1 if key == "attention_mask" or is_answer else 0
+            extension = torch.full_like(tokens, value)[None]
+            inputs[key] = torch.cat([prompt[key], extension], dim=1)
+    return inputs
+
+
 def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
     """Compare the likelihood of the longest name with that of the network itself, read
     with the prompt at once.
@@ -495,16 +513,7 @@ def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
     image = torch.rand((3, *module.reader.image_size), generator=generator)
     prompt = module.reader.make_inputs(image)
     name_tokens = torch.tensor(module.tokens[index], device=loaded.network.device)
-    inputs = dict(prompt)
-    inputs["input_ids"] = torch.cat([prompt["input_ids"], name_tokens[None]], dim=1)
-    for key in ("attention_mask", "mm_token_type_ids", "token_type_ids"):
-        if key in prompt:
-            # In most networks type 1 is the image, but in PaliGemma, which marks
-            # nothing before, it is the answer.
-            is_answer = key == "token_type_ids" and not prompt[key].any()
-            value = 1 if key == "attention_mask" or is_answer else 0
-            extension = torch.full_like(name_tokens, value)[None]
-            inputs[key] = torch.cat([prompt[key], extension], dim=1)
+    inputs = _append_tokens(prompt, name_tokens)
     logits = loaded.network(**inputs).logits
     if logits.shape[1] != inputs["input_ids"].shape[1]:
         raise _make_unsupported_error(

@@ -188,6 +188,13 @@ def _run_processor(processor: Any, picture: Any, spec: str) -> Array:
     return picked
 
 
+def _disable_resizing(processor: Any) -> Callable[..., Any]:
+    """Return a processor that neither resizes nor crops, for images of the right size."""
+    switches = ("do_resize", "do_center_crop")
+    disabled = {name: False for name in switches if getattr(processor, name, None)}
+    return partial(processor, **disabled)
+
+
 def _make_called_processing(
     processor: Any, spec: str, processing: Processing, what: str
 ) -> Processing:
@@ -205,10 +212,7 @@ def _make_called_processing(
     height, width = processing.get("input_size", (PROBE_SIZES[0], PROBE_SIZES[0]))
     _check_reads_all_pixels(processor, spec)
     levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
-    # An image of the right size is neither resized nor cropped.
-    switches = ("do_resize", "do_center_crop")
-    off = {name: False for name in switches if getattr(processor, name, None)}
-    process = partial(processor, **off)
+    process = _disable_resizing(processor)
     expected = _run_processor(process, levels, spec)
     image = torch.from_numpy(levels).float() / 255.0
     images = image.movedim(2, 0)[None].requires_grad_()
@@ -325,8 +329,9 @@ class LoadedNetwork:
 
     @cached_property
     def preprocessing(self) -> Processing:
-        """The preprocessing of images. Raises ModelError as `measure_processor`; warns if there is no image
-        processor.
+        """The preprocessing of images.
+
+        Raises ModelError as `measure_processor`; warns if there is no image processor.
         """
         if self.processor is None:
             models.warn(
@@ -359,7 +364,10 @@ class LoadedNetwork:
     def make_source(
         self, ask: RunNetwork, *, boxes: bool = False, **fields: Any
     ) -> models.Source:
-        """Return the source of the network as `AdaptedNetwork` calls it; `fields` go to `Source`."""
+        """Return the source of the network as `AdaptedNetwork` calls it.
+
+        `fields` go to `Source`.
+        """
         return models.make_source(
             AdaptedNetwork(self.network, ask, boxes=boxes),
             self.name,

@@ -398,18 +398,28 @@ def load_torchvision(spec: str) -> models.Source:
             AdaptedNetwork(module, _run_segmenter), name, **fields
         )
     fields |= {"mean": None, "std": None, "batch_limits": (1, MAX_DETECTOR_BATCH)}
-    # The transform would resize a square image.
-    transform = getattr(module, "transform", None)
-    fixed_size = getattr(transform, "fixed_size", None)
-    min_size = getattr(transform, "min_size", None)
-    if fixed_size:
-        fields["input_size"] = int(fixed_size[1]), int(fixed_size[0])
-    elif min_size:
-        size = int(min_size if isinstance(min_size, int) else min_size[-1])
-        fields["input_size"] = (size, size)
+    input_size = _find_detector_size(module)
+    if input_size is not None:
+        fields["input_size"] = input_size
     return models.make_source(
         AdaptedNetwork(module, _run_detector, boxes=True), name, **fields
     )
+
+
+def _find_detector_size(module: nn.Module) -> tuple[int, int] | None:
+    """Return the (height, width) to which a detector's transform resizes a square image.
+
+    None if it does not state it.
+    """
+    transform = getattr(module, "transform", None)
+    fixed_size = getattr(transform, "fixed_size", None)
+    if fixed_size:
+        return int(fixed_size[1]), int(fixed_size[0])
+    min_size = getattr(transform, "min_size", None)
+    if not min_size:
+        return None
+    size = int(min_size if isinstance(min_size, int) else min_size[-1])
+    return size, size
 
 
 def _check_reads_images(zoo: Any, name: str, spec: str) -> None:

@@ -59,15 +59,8 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
         torch.no_grad(),
     ):
         network: Any = models.copy_sharing_weights(loaded.network).eval()
-        if hasattr(network, "temperature"):
-            scale = network.temperature.reciprocal()
-        else:
-            scale = network.logit_scale.exp()
         embeddings = embed_words(network, tokenizer, words, prompts)
-        head = nn.Linear(embeddings.shape[1], len(names))
-        head.weight.copy_(scale.float() * embeddings)
-        bias = network.logit_bias.float() if has_sigmoid else torch.zeros(())
-        head.bias.copy_(bias)
+        head = _make_head(network, embeddings)
         classifier = _CosineClassifier(network, head.to(network.device))
         result = loaded.make_text_source(classifier, names, network.dtype)
         _check_scores(network, classifier, tokenizer, texts[0], result)
@@ -80,6 +73,24 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
             "logits"
         )
     return result
+
+
+def _make_head(network: Any, embeddings: Tensor) -> nn.Linear:
+    """Return the layer from embeddings of images to logits of names.
+
+    Args:
+        network: states the scale of cosines, and maybe a bias.
+        embeddings: (names, F) of the names, of length 1.
+    """
+    if hasattr(network, "temperature"):
+        scale = network.temperature.reciprocal()
+    else:
+        scale = network.logit_scale.exp()
+    head = nn.Linear(embeddings.shape[1], embeddings.shape[0])
+    head.weight.copy_(scale.float() * embeddings)
+    has_bias = hasattr(network, "logit_bias")
+    head.bias.copy_(network.logit_bias.float() if has_bias else torch.zeros(()))
+    return head
 
 
 def check_takes_pictures(network: Any, spec: str) -> None:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Query, Random, SearchResult, search
-from advsearch.attacks.evaluation import Policy, seeded, use_one_thread
+from advsearch.attacks.evaluation import Policy, limit_to_single_thread, seeded
 from advsearch.attacks.policies.auto import LOW_DIM, make_plan
 from advsearch.attacks.policies.surrogate import find_box_coordinates, fit
 from covering import once_each
@@ -264,7 +264,7 @@ def test_the_surrogate_predicts_what_it_has_not_seen_and_averages_noise() -> Non
     box = find_box_coordinates(domain_of((Block(2),)))
     x = box.sample_screen(3, 60)
     y = torch.sin(5 * x[:, 0]) + 0.2 * torch.randn(60, generator=seeded(0, 0))
-    with use_one_thread():
+    with limit_to_single_thread():
         surrogate = fit(box, x, y)
     new = box.sample_screen(4, 200)
     mean, deviation = surrogate.predict(new)

@@ -28,7 +28,7 @@ from advsearch.attacks import (
     search,
     seeded,
 )
-from advsearch.attacks.policies.evolution import WIDEST, utilities
+from advsearch.attacks.policies.evolution import MAX_STEP_SIZE, utilities
 from advsearch.errors import InputError
 
 both = pytest.mark.parametrize("policy", [CMAES(), NES()], ids=lambda policy: policy.name)
@@ -222,7 +222,7 @@ def test_nes_narrows_on_a_peak_and_widens_on_a_slope() -> None:
     slope = search(evaluator(lambda u: float(u[0])), domain, NES(sigma=0.02), steps=60, seed=0).distribution
     assert narrow is not None and slope is not None
     assert float(narrow.deviation.max()) < 0.05
-    assert 0.01 < float(slope.deviation[0]) <= 0.5 * WIDEST
+    assert 0.01 < float(slope.deviation[0]) <= 0.5 * MAX_STEP_SIZE
 
 
 def test_a_texture_takes_a_few_vectors_of_memory_only() -> None:

@@ -130,7 +130,7 @@ def test_a_power_of_two_of_points_is_balanced() -> None:
 def test_chunks_continue_the_sequence(monkeypatch: pytest.MonkeyPatch) -> None:
     domain = Domain(torch.full((3,), 0.5), (Block(3),))
     whole, _ = points(Sobol(), domain, 50)
-    monkeypatch.setattr("advsearch.attacks.policies.sampling.CHUNK", 24)
+    monkeypatch.setattr("advsearch.attacks.policies.sampling.MAX_CHUNK_NUMBERS", 24)
     parts, _ = points(Sobol(), domain, 50)
     assert torch.equal(whole, parts)
     assert len({tuple(u) for u in whole.tolist()}) == 50

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
 from advsearch.attacks.candidates import FailureRate, Failures, estimate_failure_rate
-from advsearch.attacks.evaluation import use_one_thread
+from advsearch.attacks.evaluation import limit_to_single_thread
 from advsearch.errors import InputError
 
 BOX = Domain(
@@ -96,7 +96,7 @@ def test_an_interval_covers_as_often_as_it_says() -> None:
         density = torch.where(x < 0.2, 1.0 - often + 5.0 * often, 1.0 - often)
         x[:50], density[:50] = even[:50], 1.0
         bounds = torch.cat([torch.ones(50), torch.full((100,), 1.0 / (1.0 - often))])
-        with use_one_thread():
+        with limit_to_single_thread():
             told = estimate_failure_rate(1.0 / density, bounds, x < truth, torch.zeros(150, dtype=torch.bool))
         missed += not told.interval[0] <= truth <= told.interval[1]
     assert missed <= 5

@@ -36,7 +36,7 @@ from advsearch.attacks import (
     seeded,
 )
 from advsearch.attacks.policies import choices
-from advsearch.attacks.policies.choices import MOST, wrap_choices
+from advsearch.attacks.policies.choices import MAX_COMBINATIONS, wrap_choices
 from advsearch.errors import InputError, UnknownNameError
 
 BOX = Domain(torch.tensor([0.3, 0.6]), (Block(2),))
@@ -254,7 +254,7 @@ def test_combinations_race_and_the_starts_is_among_them() -> None:
     assert combinations[0] == (45, 36)
     assert torch.equal(seen[0][:2], domain.start[:2])
     counts = Counter(combinations)
-    assert 20 < len(counts) <= MOST
+    assert 20 < len(counts) <= MAX_COMBINATIONS
     assert counts.most_common(1)[0][0] == (int(result.best_u[0] * 50), int(result.best_u[1] * 40))
 
 
