@@ -174,9 +174,9 @@ class ExperimentCommand:
                 **read_defaults(find_run(run_name) / CONFIG, vars(args)),
             )
         missing = [
-            one.flag
-            for one in settings(config_type)
-            if one.required and one.field not in args
+            setting.flag
+            for setting in settings(config_type)
+            if setting.required and setting.field not in args
         ]
         if missing:
             command = f"advsearch {self.name}"

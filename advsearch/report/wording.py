@@ -112,18 +112,18 @@ def percent_number(share: float, most: int = MOST_DECIMALS) -> str:
     most, as show how far it is away.
     """
     value = 100.0 * share
-    away = min(value, 100.0 - value)
-    if away >= 5.0 or away <= 0.0:
+    distance = min(value, 100.0 - value)
+    if distance >= 5.0 or distance <= 0.0:
         return f"{value:.0f}"
-    decimals = min(max(1, -math.floor(math.log10(away))), most)
+    decimals = min(max(1, -math.floor(math.log10(distance))), most)
     text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
     if text not in ("0", "100"):
         return text
-    least = 10.0**-decimals
+    smallest = 10.0**-decimals
     return (
-        f"under {least:.{decimals}f}"
+        f"under {smallest:.{decimals}f}"
         if text == "0"
-        else f"over {100.0 - least:.{decimals}f}"
+        else f"over {100.0 - smallest:.{decimals}f}"
     )
 
 
@@ -170,27 +170,29 @@ def beside_text(run: str, pair: Any) -> str:
     """Return what a model does without and with the adversarial scene of a run
     (`PairedRates`), in sentences.
     """
-    sides = [
-        f"{side.correct} of {side.configurations} ({percent(side.accuracy)}, 95 % "
+    arm_texts = [
+        f"{arm.correct} of {arm.configurations} ({percent(arm.accuracy)}, 95 % "
         "interval "
-        f"{interval_text(side.interval)})"
-        for side in (pair.clean, pair.answer)
+        f"{interval_text(arm.interval)})"
+        for arm in (pair.clean, pair.answer)
     ]
-    low, high = (100.0 * end for end in pair.interval)
-    ends = (
-        f"{-high:.0f} to {-low:.0f}"
+    lower, upper = (100.0 * bound for bound in pair.interval)
+    interval_of_points = (
+        f"{-upper:.0f} to {-lower:.0f}"
         if pair.difference < 0
-        else f"{low:.0f} to {high:.0f}"
+        else f"{lower:.0f} to {upper:.0f}"
     )
-    shown = (
-        "" if low > 0.0 or high < 0.0 else ("; that there is a difference is not shown")
+    no_difference_text = (
+        ""
+        if lower > 0.0 or upper < 0.0
+        else ("; that there is a difference is not shown")
     )
     return (
-        f"{pair.model} is right in {sides[0]} of the clean scene, and in {sides[1]} "
+        f"{pair.model} is right in {arm_texts[0]} of the clean scene, and in {arm_texts[1]} "
         "with the adversarial scene of "
         f"{run}: {abs(100.0 * pair.difference):.0f} points "
         f"{'fewer' if pair.difference < 0 else 'more'} (95 % "
-        f"interval of pairs {ends}){shown}. Right in the clean one alone are "
+        f"interval of pairs {interval_of_points}){no_difference_text}. Right in the clean one alone are "
         f"{pair.clean_only} pairs, with the "
         f"adversarial one alone {pair.answer_only}."
     )
@@ -242,14 +244,17 @@ def prediction_cells(task: str, prediction: Said) -> list[str]:
     if share is None:
         return [label, ""]
     if task == SIMILARITY:
-        kept = getattr(prediction, "payload", None)
-        similar = percent(share, PROBABILITY_DECIMALS)
-        if isinstance(kept, dict) and "cosine" in kept:
-            if "rank" not in kept:
-                similar = f"cosine {kept['cosine']:.2f}"
-            elif kept["rank"] > 1:
-                similar += f", right one at rank {kept['rank']} of {kept['references']}"
-        return [label, similar]
+        payload = getattr(prediction, "payload", None)
+        similarity_text = percent(share, PROBABILITY_DECIMALS)
+        if isinstance(payload, dict) and "cosine" in payload:
+            rank = payload.get("rank")
+            if "rank" not in payload:
+                similarity_text = f"cosine {payload['cosine']:.2f}"
+            elif rank > 1:
+                similarity_text += (
+                    f", right one at rank {rank} of {payload['references']}"
+                )
+        return [label, similarity_text]
     if task == DETECTION:
         payload = getattr(prediction, "payload", None)
         outcome = get_outcome(payload)
@@ -297,27 +302,20 @@ SEEN = ("seen", "box", "distance")  # Heads of `things_rows`, behind the name
 
 
 def things_rows(things: Mapping[str, Any]) -> list[list[str]]:
-    """Return what is seen of each thing, for a table, from its name to
+    """Return what is visible of each thing, for a table, from its name to
     `runs.results.ThingSeen` as a mapping.
     """
     rows = []
-    for name, seen in things.items():
-        share = (
-            "nothing"
-            if seen["box"] is None
-            else "in part"
-            if seen["share"] is None
-            else percent(seen["share"])
-        )
-        box = "" if seen["box"] is None else ", ".join(map(str, seen["box"]))
-        rows.append(
-            [
-                name,
-                share,
-                box,
-                "" if seen["distance"] is None else f"{seen['distance']:.1f} m",
-            ]
-        )
+    for name, thing in things.items():
+        if thing["box"] is None:
+            visible = "nothing"
+        elif thing["share"] is None:
+            visible = "in part"
+        else:
+            visible = percent(thing["share"])
+        box = "" if thing["box"] is None else ", ".join(map(str, thing["box"]))
+        distance = "" if thing["distance"] is None else f"{thing['distance']:.1f} m"
+        rows.append([name, visible, box, distance])
     return rows
 
 
@@ -444,18 +442,18 @@ def rate_text(rated: VerifiedRate) -> str:
     """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``; and how many outputs
     are not numbers.
     """
-    nothing = (
+    nan_text = (
         f"in {rated.not_a_number} its output is not a number"
         if rated.not_a_number
         else ""
     )
-    if nothing and not rated.successes:
-        return f"none of {rated.trials} fresh renders: {nothing}"
+    if nan_text and not rated.successes:
+        return f"none of {rated.trials} fresh renders: {nan_text}"
     rate = (
         f"{rated.successes} of {rated.trials} fresh renders (95 % interval "
         f"{interval_text(rated.interval)})"
     )
-    return f"{rate}, and {nothing}" if nothing else rate
+    return f"{rate}, and {nan_text}" if nan_text else rate
 
 
 def rated_cells(rated: VerifiedRate | ControlGroup) -> list[str]:
@@ -463,29 +461,29 @@ def rated_cells(rated: VerifiedRate | ControlGroup) -> list[str]:
     outputs that are not numbers, how many.
     """
     number = rated.successes if hasattr(rated, "successes") else rated.correct
-    nothing = f", {rated.not_a_number} not a number" if rated.not_a_number else ""
-    return [f"{number}/{rated.trials}{nothing}", interval_text(rated.interval)]
+    nan_text = f", {rated.not_a_number} not a number" if rated.not_a_number else ""
+    return [f"{number}/{rated.trials}{nan_text}", interval_text(rated.interval)]
 
 
 def tally(what: str, number: int, trials: int, not_a_number: int = 0) -> str:
     """Return ``wrong in 20 of 20``; of outputs that are not numbers, how many."""
-    nothing = f"not a number in {not_a_number} of {trials}"
+    nan_text = f"not a number in {not_a_number} of {trials}"
     if not not_a_number:
         return f"{what} in {number} of {trials}"
-    return f"{what} in {number}, {nothing}" if number else nothing
+    return f"{what} in {number}, {nan_text}" if number else nan_text
 
 
 def seconds_text(seconds: Any) -> str:
     """Return ``14.6 s``, ``3 min 5 s`` or ``2 h 10 min``."""
     if seconds is None:
         return "unknown"
-    whole = round(float(seconds))
-    if whole < 100:
+    total = round(float(seconds))
+    if total < 100:
         return f"{float(seconds):.1f} s"
     return (
-        f"{whole // 60} min {whole % 60} s"
-        if whole < 6000
-        else f"{whole // 3600} h {whole % 3600 // 60} min"
+        f"{total // 60} min {total % 60} s"
+        if total < 6000
+        else f"{total // 3600} h {total % 3600 // 60} min"
     )
 
 
@@ -510,13 +508,13 @@ def workers_text(shared: SharedWork | None) -> str:
         "refused": shared.refused,
         "given out again": shared.retried,
     }
-    listed = [f"{number} {what}" for what, number in counts.items() if number]
-    first = [
+    count_texts = [f"{number} {event}" for event, number in counts.items() if number]
+    summary = [
         f"{shared.most} at most",
         busy,
         f"loading took {seconds_text(shared.loading)}",
     ]
-    return ", ".join(filter(None, [*first, *listed]))
+    return ", ".join(filter(None, [*summary, *count_texts]))
 
 
 def formation_text(
@@ -532,19 +530,17 @@ def formation_text(
         else f"denoised ({formation.denoiser})"
     )
     exposure = f"exposure {number_text(formation.exposure)} stops"
-    made = (
+    description = (
         f"{height} x {width} pixels, {formation.filter} filter, {denoised}, {exposure}"
     )
     if formation.gain is not None:
-        return (
-            f"{made}, sampler {formation.sampler}, gain {number_text(formation.gain)}"
-        )
+        return f"{description}, sampler {formation.sampler}, gain {number_text(formation.gain)}"
     names = {name: ", ".join(map(short_name, name.split(", "))) for name in gains or {}}
-    each = "; ".join(
+    gain_texts = "; ".join(
         f"{names[name]} {number_text(value)}" for name, value in (gains or {}).items()
     )
-    return f"{made}, sampler {formation.sampler}, a gain for each scene" + (
-        f": {each}" if each else ""
+    return f"{description}, sampler {formation.sampler}, a gain for each scene" + (
+        f": {gain_texts}" if gain_texts else ""
     )
 
 
@@ -556,7 +552,7 @@ def number_text(value: Any) -> str:
 
 
 def conditions_text(conditions: Sequence[ConditionRow]) -> str:
-    return " and ".join(one.text for one in conditions) or (
+    return " and ".join(condition.text for condition in conditions) or (
         "everything that was looked at"
     )
 
