@@ -104,8 +104,8 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
         "morph targets (--control 'body={NAME.weight: [0, 1]}')": targets,
     }
     lines += _format_names(names_by_kind)
-    notes = [*inside.object.warnings, *slow]
-    return facts, lines + [f"Note: {note}" for note in notes]
+    lines += [f"Note: {note}" for note in (*inside.object.warnings, *slow)]
+    return facts, lines
 
 
 def _format_names(names_by_kind: Mapping[str, Iterable[str]]) -> list[str]:
@@ -181,7 +181,9 @@ def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
         f"'{file}#{nodes[-1].name}'",
     ]
     if len(nodes) > 1:
-        lines.append(f"Another one moves with it: --control pose,pose:{nodes[0].mesh}")
+        lines.append(
+            f"Another one moves with it: --control pose,pose:{nodes[0].mesh_name}"
+        )
     return lines
 
 

@@ -105,13 +105,18 @@ def report(args: argparse.Namespace) -> int:
     )
     for path, content in zip(output_paths, contents, strict=True):
         writing.write_text(path, content)
+    text = _format_evidence(evidence, output_paths)
+    return output.say(args.json, evidence.to_dict(), text)
+
+
+def _format_evidence(evidence: Any, output_paths: Sequence[Path]) -> str:
+    """Return the claims of all runs, notes, and the paths of the files, as text."""
     lines = []
     for run in evidence.runs:
         lines.append(run.run)
         lines += [f"  {claim.kind}: {claim.statement}" for claim in run.claims]
     notes = "".join(f"\nNote: {warning}" for warning in evidence.warnings)
-    text = "\n".join([*lines, notes, *map(str, output_paths)])
-    return output.say(args.json, evidence.to_dict(), text)
+    return "\n".join([*lines, notes, *map(str, output_paths)])
 
 
 def _check_arguments(args: argparse.Namespace, output_paths: Sequence[Path]) -> None:

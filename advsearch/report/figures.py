@@ -407,15 +407,14 @@ def contact_sheet(
     """
     factor = math.ceil(NARROWEST / pictures[0].shape[1])
     height, width = (factor * side for side in pictures[0].shape[:2])
-    cell_width = width + GAP
-    cell_height = height + LINE * max(map(len, captions)) + GAP
+    cell = width + GAP, height + LINE * max(map(len, captions)) + GAP
     n_columns = columns_for(len(pictures))
     n_rows = math.ceil(len(pictures) / n_columns)
-    sheet_size = GAP + n_columns * cell_width, GAP + n_rows * cell_height
+    sheet_size = GAP + n_columns * cell[0], GAP + n_rows * cell[1]
     sheet = Image.new("RGB", sheet_size, "white")
     for index, (picture, lines) in enumerate(zip(pictures, captions, strict=True)):
         row, column = divmod(index, n_columns)
-        corner = GAP + column * cell_width, GAP + row * cell_height
+        corner = GAP + column * cell[0], GAP + row * cell[1]
         _paste_tile(sheet, picture, lines, corner, (width, height))
     levels: Floats = np.asarray(sheet, dtype=np.float32)
     return np.asarray(levels / np.float32(255.0))

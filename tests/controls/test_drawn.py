@@ -21,6 +21,7 @@ from advsearch.controls.ranges import DistributionRange
 from advsearch.distributions import distribution_to_setting
 from advsearch.engine.loading import controls_to_settings, list_session_only_controls, load_scene, make_controls
 from advsearch.errors import InputError
+from advsearch.questions.attack.carry_out import make_attack_controls
 from advsearch.questions.attack.settings import AttackConfig
 
 MUG = load_scene("mug").description
@@ -182,7 +183,7 @@ def test_a_search_refuses_what_says_how_likely_values_are() -> None:
     given = {"camera": {"azimuth": NORM}}
     config = AttackConfig(object="mug", controls=given)
     with pytest.raises(InputError, match=r"camera.azimuth: .* put it into `over`"):
-        make_controls(config, given, {})
+        make_attack_controls(config, given, {})
     drawn = make_attack_controls(AttackConfig(object="mug", controls={"pose": {}}, over=given), {"pose": {}}, given)[1]
     assert [one.name for one in drawn] == ["camera"]
 

@@ -106,12 +106,12 @@ def test_environments_have_one_arrangement(coarse: list[SurfaceRenderer]) -> Non
 class Two:
     """Two workers, which carry out batches in any order, each with scenes of its own."""
 
-    facts = WorkerStats(most=2)
+    stats = WorkerStats(most=2)
 
     def __init__(self, job: Any) -> None:
         self.scenes = [SceneLoader(job), SceneLoader(job)]
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
+    def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         pieces = list(batches)
         random.Random(1).shuffle(pieces)
         for number, items in enumerate(pieces):

@@ -79,7 +79,7 @@ def apply_textures(
     used_by_id = {id(surfaces[part]): surfaces[part] for part in np.unique(soup.part)}
     used = list(used_by_id.values())
     first = used[0]
-    is_uniform = all(surface.same_maps(first) for surface in used)
+    is_uniform = all(surface.has_same_maps(first) for surface in used)
     has_one_factor = bool((soup.colors == soup.colors[0, 0]).all())
     _, material = index_materials(soup, surfaces)
     is_lit_twice = False
@@ -94,7 +94,7 @@ def apply_textures(
             is_usable = _is_usable(soup, uvs)
             is_lit_twice = is_usable and _is_lit_twice(uvs, first, images)
             if is_usable and not is_lit_twice:
-                return _texture_with_images(soup, uvs, first.with_pictures(images))
+                return _texture_with_images(soup, uvs, first.with_images(images))
     unwrapped_soup = unwrap(soup, material)
     maps = bake(unwrapped_soup.uvs, soup, surfaces)
     reason = (

@@ -66,7 +66,7 @@ class Categories:
             try:
                 category = object_category
                 if thing.name != "object":
-                    label_set = models.find_label_set(image.label_of(thing), labels)
+                    label_set = models.find_label_set(image.get_label(thing), labels)
                     category = label_set.indices[0]
                 things.append((thing, category))
             except InputError:

@@ -170,16 +170,26 @@ def make_marks(
     for down, across in itertools.product(SHARES, SHARES):
         row = int(down * n_rows)
         column = int(across * n_columns)
-        x = (column + 0.5) * factor
-        y = (row + 0.5) * factor
-        draw.line((x - arm, y, x + arm, y), fill=255, width=line)
-        draw.line((x, y - arm, x, y + arm), fill=255, width=line)
         marked_texels.append(
             (row, column, (column + 0.5) / n_columns, (row + 0.5) / n_rows)
         )
-        text = str(len(marked_texels))
-        draw.text((x + line, y + line), text, fill=255, font_size=arm)
+        center = (column + 0.5) * factor, (row + 0.5) * factor
+        draw_cross(draw, center, arm, line, str(len(marked_texels)))
     levels = torch.frombuffer(bytearray(picture.tobytes()), dtype=torch.uint8).reshape(
         height, width, 1
     )
     return levels.expand(-1, -1, 3) / 255.0, marked_texels
+
+
+def draw_cross(
+    draw: ImageDraw.ImageDraw,
+    center: tuple[float, float],
+    arm: int,
+    line: int,
+    text: str,
+) -> None:
+    """Draw a white cross with its number; lengths are in pixels."""
+    x, y = center
+    draw.line((x - arm, y, x + arm, y), fill=255, width=line)
+    draw.line((x, y - arm, x, y + arm), fill=255, width=line)
+    draw.text((x + line, y + line), text, fill=255, font_size=arm)
