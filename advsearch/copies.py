@@ -65,13 +65,13 @@ def is_ours(kind: type) -> bool:
     return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
 
 
-def hand_copies(kind: type, **places: slice) -> None:
+def hand_copies(kind: type, **argument_slices: slice) -> None:
     """Have methods that a class outside of this package defines called with copies of
     their arguments: by name, of which after `self`, and of all by keyword.
     """
     if is_ours(kind):
         return
-    for name, argument_slice in places.items():
+    for name, argument_slice in argument_slices.items():
         method = vars(kind).get(name)
         if isinstance(method, FunctionType):
             setattr(kind, name, _handing(method, argument_slice))

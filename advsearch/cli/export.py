@@ -40,36 +40,51 @@ def _begin_lower(sentence: str) -> str:
 @command(
     argument("run", metavar="RUN", help="a run's name or folder"),
     _add_format,
-    argument("--out", metavar="FILE", help="the file to write (default: standard "
-                                           "output)"),
-    argument("--json", action="store_true", help="the same as --format json; with "
-                                                 "--out, tell what was written"),
-    argument("--kind", help="only rows of this kind: search, baseline, sweep, ... "
-                            "(default: all)"),
     argument(
-        "--size", metavar="MM", type=float,
-        help="print: the real object's longest side in millimetres (default: its own "
-             "where that is known, or 100)",
+        "--out", metavar="FILE", help="the file to write (default: standard output)"
     ),
     argument(
-        "--sheets", metavar="N", type=int, help="print: sheets that may be written; "
-                                                "more are refused (default: 200)"
+        "--json",
+        action="store_true",
+        help="the same as --format json; with --out, tell what was written",
+    ),
+    argument(
+        "--kind",
+        help="only rows of this kind: search, baseline, sweep, ... (default: all)",
+    ),
+    argument(
+        "--size",
+        metavar="MM",
+        type=float,
+        help="print: the real object's longest side in millimetres (default: its own "
+        "where that is known, or 100)",
+    ),
+    argument(
+        "--sheets",
+        metavar="N",
+        type=int,
+        help="print: sheets that may be written; more are refused (default: 200)",
     ),
     argument("--paper", help="print: a4, a3 or letter (default: a4)"),
     argument(
-        "--all", action="store_true", default=None,
+        "--all",
+        action="store_true",
+        default=None,
         help="coco, yolo: right predictions too (default: pictures that a model is "
-             "wrong about)",
+        "wrong about)",
     ),
     output.add_code_flag,
-    argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer "
-                                           "(default: sRGB)"),
+    argument(
+        "--icc",
+        metavar="FILE",
+        help="print: ICC profile of an RGB printer (default: sRGB)",
+    ),
     examples=(
         "export mug-texture-001",
         "export runs/mug-texture-001 --kind search --out search.parquet",
         *(EXPORTERS[name].example for name in EXPORTERS.built_ins),
     ),
-)  # fmt: skip
+)
 def export(args: argparse.Namespace) -> int:
     """Write what the arguments of `export` ask for, and return the exit status."""
     out = None if args.out is None else Path(args.out)

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from advsearch.experiment import Experiment
     from advsearch.settings import Config
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # The commands: what the help lists, and what carries each out.
 #
 # An experiment's command is made from it (`advsearch.experiment.Experiment`). Others

@@ -29,13 +29,25 @@ BLUE = "#1d5fd0"
 RED = "#b3261e"
 GREY = "#5c606a"
 STYLE: dict[Any, Any] = {
-    "font.family": ["DejaVu Sans"], "font.size": 9.0, "legend.frameon": False, "legend.fontsize": 8.0,
-    "axes.axisbelow": True, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": GREY,
-    "axes.labelcolor": "#1c1d20", "axes.titlelocation": "left", "axes.titlesize": 10.0, "axes.titleweight": "bold",
-    "grid.color": "#dfe0e3", "grid.linewidth": 0.7, "svg.hashsalt": "advsearch", "svg.fonttype": "none",
+    "font.family": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": "#1c1d20",
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10.0,
+    "axes.titleweight": "bold",
+    "grid.color": "#dfe0e3",
+    "grid.linewidth": 0.7,
+    "svg.hashsalt": "advsearch",
+    "svg.fonttype": "none",
     # names come from users: a dollar sign in one is no formula
     "text.parse_math": False,
-}  # fmt: skip
+}
 
 
 def new_axes() -> Any:
@@ -226,7 +238,7 @@ def figure_of(draw: Callable[[Any], object], size: tuple[float, float]) -> Figur
     return drawn(lambda figure: draw(figure.subplots()), size)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # Pictures with something drawn into them, boxes and masks of what is true and what is
 # said; or several on a sheet.
 
@@ -412,12 +424,11 @@ def contact_sheet(
     n_rows = math.ceil(len(pictures) / n_columns)
     sheet_size = GAP + n_columns * cell[0], GAP + n_rows * cell[1]
     sheet = Image.new("RGB", sheet_size, "white")
-    for index, (picture, lines) in enumerate(zip(pictures, captions, strict=True)):
+    for index, picture in enumerate(pictures):
         row, column = divmod(index, n_columns)
         corner = GAP + column * cell[0], GAP + row * cell[1]
-        _paste_tile(sheet, picture, lines, corner, (width, height))
-    levels: Floats = np.asarray(sheet, dtype=np.float32)
-    return np.asarray(levels / np.float32(255.0))
+        _paste_tile(sheet, picture, captions[index], corner, (width, height))
+    return np.asarray(np.asarray(sheet, dtype=np.float32) / np.float32(255.0))
 
 
 def _paste_tile(

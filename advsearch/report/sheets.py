@@ -109,9 +109,15 @@ class Placed:
 
 
 def write_sheets(
-    path: Path, pieces: Sequence[Piece], title: str, *, paper: str = "a4", profile: Path | None = None,
-    most: int = MOST_SHEETS, last: Callable[[str, tuple[float, float], Any], Figure] | None = None,
-) -> int:  # fmt: skip
+    path: Path,
+    pieces: Sequence[Piece],
+    title: str,
+    *,
+    paper: str = "a4",
+    profile: Path | None = None,
+    most: int = MOST_SHEETS,
+    last: Callable[[str, tuple[float, float], Any], Figure] | None = None,
+) -> int:
     """Write the PDF of at least one piece, and return how many pages it has.
 
     Colours are converted into an ICC `profile` of an RGB printer; None leaves them

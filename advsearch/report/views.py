@@ -458,7 +458,7 @@ def claim(kind: Kind, text: str, extent: Extent | None) -> Claim:
     return Claim(kind=kind, statement=text, extent=extent)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # HTML that is escaped by construction: text becomes markup only through `element`.
 #
 # And results as a notebook shows them (what is said, pictures or a figure, and tables,
@@ -632,14 +632,27 @@ COLORS = {
 # The same of the colours that figures have
 OF_FIGURES = {"search": BLUE, "baseline": RED, "soft": GREY}
 STYLE: dict[Any, Any] = {
-    "font.size": 13.0, "path.simplify": False,
-    "legend.fontsize": 13.0, "legend.labelcolor": "linecolor", "legend.borderpad": 0.0, "legend.handlelength": 1.6,
-    "axes.spines.left": False, "axes.grid.axis": "y", "axes.grid": True,
-    **dict.fromkeys(("axes.edgecolor", "grid.color", "xtick.color", "ytick.color"), COLORS["line"]),
-    **dict.fromkeys(("axes.labelcolor", "text.color", "xtick.labelcolor", "ytick.labelcolor"), COLORS["soft"]),
+    "font.size": 13.0,
+    "path.simplify": False,
+    "legend.fontsize": 13.0,
+    "legend.labelcolor": "linecolor",
+    "legend.borderpad": 0.0,
+    "legend.handlelength": 1.6,
+    "axes.spines.left": False,
+    "axes.grid.axis": "y",
+    "axes.grid": True,
+    **dict.fromkeys(
+        ("axes.edgecolor", "grid.color", "xtick.color", "ytick.color"), COLORS["line"]
+    ),
+    **dict.fromkeys(
+        ("axes.labelcolor", "text.color", "xtick.labelcolor", "ytick.labelcolor"),
+        COLORS["soft"],
+    ),
     **dict.fromkeys(("xtick.major.size", "ytick.major.size"), 0.0),
-    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"),
-}  # fmt: skip
+    **dict.fromkeys(
+        ("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"
+    ),
+}
 
 
 def study_chart(
@@ -663,9 +676,14 @@ def study_chart(
 
     (file,) = drawn(on_figure, (width / 72, height / 72), ("svg",), STYLE).values()
     return element(
-        "svg", element("title", words), _inline(file.decode("utf-8"), f"{width}-"), viewBox=f"0 0 {width} {height}",
-        class_="chart wide" if width == WIDE else "chart narrow", role="img", aria_label=words,
-    )  # fmt: skip
+        "svg",
+        element("title", words),
+        _inline(file.decode("utf-8"), f"{width}-"),
+        viewBox=f"0 0 {width} {height}",
+        class_="chart wide" if width == WIDE else "chart narrow",
+        role="img",
+        aria_label=words,
+    )
 
 
 def _inline(svg: str, prefix: str) -> Html:

@@ -167,34 +167,32 @@ def with_article(name: str) -> str:
 
 
 def beside_text(run: str, pair: Any) -> str:
-    """Return what a model does without and with the adversarial scene of a run
+    """Return how often a model is right without and with the adversarial scene of a run
     (`PairedRates`), in sentences.
     """
-    arm_texts = [
+    clean, adversarial = (
         f"{arm.correct} of {arm.configurations} ({percent(arm.accuracy)}, 95 % "
         "interval "
         f"{interval_text(arm.interval)})"
         for arm in (pair.clean, pair.answer)
-    ]
+    )
     lower, upper = (100.0 * bound for bound in pair.interval)
-    interval_of_points = (
-        f"{-upper:.0f} to {-lower:.0f}"
-        if pair.difference < 0
-        else f"{lower:.0f} to {upper:.0f}"
-    )
-    no_difference_text = (
-        ""
-        if lower > 0.0 or upper < 0.0
-        else ("; that there is a difference is not shown")
-    )
+    if pair.difference < 0:
+        interval = f"{-upper:.0f} to {-lower:.0f}"
+        direction = "fewer"
+    else:
+        interval = f"{lower:.0f} to {upper:.0f}"
+        direction = "more"
+    doubt = ""
+    if not (lower > 0.0 or upper < 0.0):
+        doubt = "; that there is a difference is not shown"
     return (
-        f"{pair.model} is right in {arm_texts[0]} of the clean scene, and in {arm_texts[1]} "
-        "with the adversarial scene of "
-        f"{run}: {abs(100.0 * pair.difference):.0f} points "
-        f"{'fewer' if pair.difference < 0 else 'more'} (95 % "
-        f"interval of pairs {interval_of_points}){no_difference_text}. Right in the clean one alone are "
-        f"{pair.clean_only} pairs, with the "
-        f"adversarial one alone {pair.answer_only}."
+        f"{pair.model} is right in {clean} of the clean scene, and in {adversarial} "
+        f"with the adversarial scene of {run}: "
+        f"{abs(100.0 * pair.difference):.0f} points {direction} "
+        f"(95 % interval of pairs {interval}){doubt}. "
+        f"Right in the clean one alone are {pair.clean_only} pairs, "
+        f"with the adversarial one alone {pair.answer_only}."
     )
 
 
@@ -234,46 +232,50 @@ def wanted(objective: str, thing: str) -> str:
 
 
 def prediction_cells(task: str, prediction: Said) -> list[str]:
-    """Return a prediction and its number, for a table: ``["vase", "84 %"]``, ``["no cup found", "best score of cup
-    0.12"]``.
+    """Return a prediction and its number, for a table.
+
+    For instance ``["vase", "84 %"]`` and ``["no cup found", "best score of cup 0.12"]``.
     """
     label = prediction.label
-    share = prediction.probability
+    probability = prediction.probability
+    payload = getattr(prediction, "payload", None)
     if task == COMMAND:
-        return [label, (getattr(prediction, "payload", None) or {}).get("text", "")]
-    if share is None:
+        return [label, (payload or {}).get("text", "")]
+    if probability is None:
         return [label, ""]
     if task == SIMILARITY:
-        payload = getattr(prediction, "payload", None)
-        similarity_text = percent(share, PROBABILITY_DECIMALS)
-        if isinstance(payload, dict) and "cosine" in payload:
-            rank = payload.get("rank")
-            if "rank" not in payload:
-                similarity_text = f"cosine {payload['cosine']:.2f}"
-            elif rank > 1:
-                similarity_text += (
-                    f", right one at rank {rank} of {payload['references']}"
-                )
-        return [label, similarity_text]
+        return [label, _similarity_text(probability, payload)]
     if task == DETECTION:
-        payload = getattr(prediction, "payload", None)
-        outcome = get_outcome(payload)
-        stated = payload if isinstance(payload, dict) else {}
-        if outcome is Outcome.MISSED:
-            return [
-                f"{label} found",
-                f"best score of {stated.get('class', 'it')} {share:.2f}",
-            ]
-        overlap = stated.get("iou")
-        if outcome is Outcome.LOOSE and isinstance(overlap, float):
-            return [label, f"score {share:.2f}, overlap {overlap:.2f}"]
-        return [label, f"score {share:.2f}"]
-    return [
-        label,
-        f"accuracy {percent(share)}"
-        if task == SEGMENTATION
-        else percent(share, PROBABILITY_DECIMALS),
-    ]
+        return _detection_cells(label, probability, payload)
+    if task == SEGMENTATION:
+        return [label, f"accuracy {percent(probability)}"]
+    return [label, percent(probability, PROBABILITY_DECIMALS)]
+
+
+def _similarity_text(probability: float, payload: Any) -> str:
+    """Return how similar the best reference is, and where the right one ranks."""
+    text = percent(probability, PROBABILITY_DECIMALS)
+    if not isinstance(payload, dict) or "cosine" not in payload:
+        return text
+    if "rank" not in payload:
+        return f"cosine {payload['cosine']:.2f}"
+    if payload["rank"] > 1:
+        rank = f"{payload['rank']} of {payload['references']}"
+        return f"{text}, right one at rank {rank}"
+    return text
+
+
+def _detection_cells(label: str, score: float, payload: Any) -> list[str]:
+    """Return what a detector finds, and its score and overlap."""
+    outcome = get_outcome(payload)
+    stated = payload if isinstance(payload, dict) else {}
+    if outcome is Outcome.MISSED:
+        class_name = stated.get("class", "it")
+        return [f"{label} found", f"best score of {class_name} {score:.2f}"]
+    overlap = stated.get("iou")
+    if outcome is Outcome.LOOSE and isinstance(overlap, float):
+        return [label, f"score {score:.2f}, overlap {overlap:.2f}"]
+    return [label, f"score {score:.2f}"]
 
 
 def prediction_text(task: str, prediction: Said) -> str:
@@ -281,21 +283,19 @@ def prediction_text(task: str, prediction: Said) -> str:
     cup 0.12)``.
     """
     label, number = prediction_cells(task, prediction)
-    if task == SEGMENTATION and number:
-        accuracy = (
-            f"accuracy over the object's pixels {percent(prediction.probability)}"
-        )
-        outcome = get_outcome(getattr(prediction, "payload", None))
-        if outcome is Outcome.MISSED:
-            return f"{label} found, {accuracy}"
-        return (
-            f"{label}, {accuracy}"
-            if outcome is Outcome.LOOSE
-            else f"{accuracy}, most often {label}"
-        )
-    if task == DETECTION and number:
+    if not number:
+        return label
+    if task == DETECTION:
         return f"{label} ({number})"
-    return f"{label}, {number}" if number else label
+    if task != SEGMENTATION:
+        return f"{label}, {number}"
+    accuracy = f"accuracy over the object's pixels {percent(prediction.probability)}"
+    outcome = get_outcome(getattr(prediction, "payload", None))
+    if outcome is Outcome.MISSED:
+        return f"{label} found, {accuracy}"
+    if outcome is Outcome.LOOSE:
+        return f"{label}, {accuracy}"
+    return f"{accuracy}, most often {label}"
 
 
 SEEN = ("seen", "box", "distance")  # Heads of `things_rows`, behind the name
@@ -363,7 +363,9 @@ def calls(task: str, thing: str, label: str, outcome: Outcome | None = None) -> 
     if task == DEPTH:
         return f"judges {thing} {label}"
     if task in (DETECTION, SEGMENTATION, SIMILARITY):
-        return f"takes {thing} for {label if label in WHOLE and task != DETECTION else with_article(label)}"
+        if label in WHOLE and task != DETECTION:
+            return f"takes {thing} for {label}"
+        return f"takes {thing} for {with_article(label)}"
     return f'predicts "{label}" for {thing}'
 
 
@@ -480,11 +482,9 @@ def seconds_text(seconds: Any) -> str:
     total = round(float(seconds))
     if total < 100:
         return f"{float(seconds):.1f} s"
-    return (
-        f"{total // 60} min {total % 60} s"
-        if total < 6000
-        else f"{total // 3600} h {total % 3600 // 60} min"
-    )
+    if total < 6000:
+        return f"{total // 60} min {total % 60} s"
+    return f"{total // 3600} h {total % 3600 // 60} min"
 
 
 def count(number: Any, thing: str) -> str:
@@ -493,28 +493,23 @@ def count(number: Any, thing: str) -> str:
 
 
 def workers_text(shared: SharedWork | None) -> str:
-    """How many shared the work, and where their time went; empty where nothing was
-    shared.
+    """Return how many workers shared the work, and where their time went; empty if
+    nothing was shared.
     """
     if shared is None:
         return ""
-    busy = (
-        None
-        if shared.utilisation is None
-        else f"busy {percent(shared.utilisation)} of {seconds_text(shared.alive)}"
-    )
+    texts = [f"{shared.most} at most"]
+    if shared.utilisation is not None:
+        alive = seconds_text(shared.alive)
+        texts.append(f"busy {percent(shared.utilisation)} of {alive}")
+    texts.append(f"loading took {seconds_text(shared.loading)}")
     counts = {
         "lost": shared.lost,
         "refused": shared.refused,
         "given out again": shared.retried,
     }
-    count_texts = [f"{number} {event}" for event, number in counts.items() if number]
-    summary = [
-        f"{shared.most} at most",
-        busy,
-        f"loading took {seconds_text(shared.loading)}",
-    ]
-    return ", ".join(filter(None, [*summary, *count_texts]))
+    texts += [f"{count} {event}" for event, count in counts.items() if count]
+    return ", ".join(texts)
 
 
 def formation_text(
@@ -524,24 +519,22 @@ def formation_text(
     exposure 0 stops, gain 1.35``; gains of several scenes by their names.
     """
     height, width = formation.resolution
-    denoised = (
-        "not denoised"
-        if formation.denoiser == "none"
-        else f"denoised ({formation.denoiser})"
-    )
-    exposure = f"exposure {number_text(formation.exposure)} stops"
+    denoised = "not denoised"
+    if formation.denoiser != "none":
+        denoised = f"denoised ({formation.denoiser})"
     description = (
-        f"{height} x {width} pixels, {formation.filter} filter, {denoised}, {exposure}"
+        f"{height} x {width} pixels, {formation.filter} filter, {denoised}, "
+        f"exposure {number_text(formation.exposure)} stops, "
+        f"sampler {formation.sampler}"
     )
     if formation.gain is not None:
-        return f"{description}, sampler {formation.sampler}, gain {number_text(formation.gain)}"
-    names = {name: ", ".join(map(short_name, name.split(", "))) for name in gains or {}}
-    gain_texts = "; ".join(
-        f"{names[name]} {number_text(value)}" for name, value in (gains or {}).items()
-    )
-    return f"{description}, sampler {formation.sampler}, a gain for each scene" + (
-        f": {gain_texts}" if gain_texts else ""
-    )
+        return f"{description}, gain {number_text(formation.gain)}"
+    gain_texts = []
+    for scene, gain in (gains or {}).items():
+        scene_name = ", ".join(map(short_name, scene.split(", ")))
+        gain_texts.append(f"{scene_name} {number_text(gain)}")
+    description += ", a gain for each scene"
+    return f"{description}: {'; '.join(gain_texts)}" if gain_texts else description
 
 
 def number_text(value: Any) -> str:

@@ -66,9 +66,16 @@ BEGUN_WITH = "settings"  # the note of settings that decide the run's numbers
 LONGEST_VALUE = 40  # characters of a value that an error states
 
 CONTENTS = (
-    CONFIG, *(f"{store.NAME}{ending}" for ending in ("", "-wal", "-shm", "-journal")), summary.NAME, REPORT, COLUMNS,
-    IMAGES, ARTIFACTS, AOV_FOLDER, PARTS,
-)  # fmt: skip
+    CONFIG,
+    *(f"{store.NAME}{ending}" for ending in ("", "-wal", "-shm", "-journal")),
+    summary.NAME,
+    REPORT,
+    COLUMNS,
+    IMAGES,
+    ARTIFACTS,
+    AOV_FOLDER,
+    PARTS,
+)
 """All that a run writes. `overwrite` removes these and nothing else."""
 
 

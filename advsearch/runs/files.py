@@ -141,7 +141,7 @@ def check_version(db: sqlite3.Connection, path: Path) -> None:
     )
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # Pictures of a run, (H, W, 3) or (H, W), of numpy or torch, as files: 8-bit PNG of sRGB
 # values, rounded as verification rounds them, so that the file is exactly what was
 # classified; EXR in float32; an animation of the search.

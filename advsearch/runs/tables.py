@@ -24,7 +24,7 @@ from advsearch.options import NOT_A_NUMBER, get_outcome
 from advsearch.runs.export import as_columns, as_record, each_value
 from advsearch.runs.store import NAME, Row, Store
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # Which rows of a sweep are independent: those of different *units*, each of one draw. A
 # unit is a drive with all its frames, or a picture, with the predictions of all models
 # and, where one was swept, without and with the adversarial scene of a run. Where

@@ -211,12 +211,21 @@ def make_image(image_id: int, image: Any) -> dict[str, Any]:
     height, width = image.picture.shape[:2]
     predictions: list[dict[str, Any]] = [
         {
-            "row": row.id, "kind": row.kind, "step": row.step, "right": row.correct, "label": row.label,
-            "probability": row.probability, "margin": row.margin,
-            **{name: entry["value"] for name, entry in row.values.items() if name == "model"},
+            "row": row.id,
+            "kind": row.kind,
+            "step": row.step,
+            "right": row.correct,
+            "label": row.label,
+            "probability": row.probability,
+            "margin": row.margin,
+            **{
+                name: entry["value"]
+                for name, entry in row.values.items()
+                if name == "model"
+            },
         }
         for row in image.rows
-    ]  # fmt: skip
+    ]
     configuration = {
         name: dict(entry) for name, entry in image.values.items() if name != "model"
     }

@@ -159,12 +159,11 @@ def make_marks(
         column of its texel, and the texel's center as fractions of width and height.
     """
     n_rows, n_columns = shape
-    height = n_rows * factor
     width = n_columns * factor
+    height = n_rows * factor
     picture = Image.new("L", (width, height))
     draw = ImageDraw.Draw(picture)
     line = max(2, height // 200)
-    arm = height // 24
     draw.rectangle((0, 0, width - 1, height - 1), outline=255, width=2 * line)
     marked_texels = []
     for down, across in itertools.product(SHARES, SHARES):
@@ -174,7 +173,7 @@ def make_marks(
             (row, column, (column + 0.5) / n_columns, (row + 0.5) / n_rows)
         )
         center = (column + 0.5) * factor, (row + 0.5) * factor
-        draw_cross(draw, center, arm, line, str(len(marked_texels)))
+        draw_cross(draw, center, height // 24, line, str(len(marked_texels)))
     levels = torch.frombuffer(bytearray(picture.tobytes()), dtype=torch.uint8).reshape(
         height, width, 1
     )
