@@ -205,7 +205,7 @@ def executor_of_nobody(**more: Any) -> Any:
     """An executor that has not connected, with a worker that may be given calls."""
     executor = object.__new__(DaskExecutor)
     vars(executor).update(
-        where="here", stats=WorkerStats(), _fit=frozenset({"tcp://here"}), _refused={}, _sending=None,
+        description="here", stats=WorkerStats(), _fit=frozenset({"tcp://here"}), _refused={}, _sending=None,
         _tell=lambda text: None, _contents={}, _plugin_name="files", **more,
     )  # fmt: skip
     return executor

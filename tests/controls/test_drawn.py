@@ -113,8 +113,8 @@ def test_an_endless_tail_is_left_out_on_both_sides() -> None:
 
 def test_the_clean_scene_has_its_value_where_the_distribution_has_it() -> None:
     near, far = (CameraControl(azimuth=Normal(at, 5.0)).bind(MUG) for at in (45.0, 200.0))
-    assert float(near.values(near.start)["azimuth"]) == pytest.approx(40.0, abs=1e-3) and not near.moved
-    (moved,) = far.moved  # 32 deviations away: the nearest that is ever drawn, and it is said
+    assert float(near.values(near.start)["azimuth"]) == pytest.approx(40.0, abs=1e-3) and not near.adjusted_defaults
+    (moved,) = far.adjusted_defaults  # 32 deviations away: the nearest that is ever drawn, and it is said
     assert moved.used == pytest.approx(176.2, abs=0.1) == float(far.values(far.start)["azimuth"])
 
 

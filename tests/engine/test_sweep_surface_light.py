@@ -38,10 +38,10 @@ KITCHEN_TOO: dict[str, Any] = {"environment.which": ["studio", "kitchen"], "came
 def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[SurfaceRenderer]]:
     """Few texels and rays, which pay at once, and are near enough; those that are made."""
     monkeypatch.setattr(texels, "GROUND_TEXELS", 24)
-    for name, value in {"SIDE": 32, "GATHERED": 48}.items():
+    for name, value in {"OBJECT_TEXELS": 32, "RAYS_PER_TEXEL": 48}.items():
         monkeypatch.setattr(arrangement, name, value)
     monkeypatch.setattr(predicting, "MIN_SAVING_FACTOR", 0.0)
-    for name, number in {"CHECK_SPP": 2, "BOUND": 50.0, "MARGIN": 50.0}.items():
+    for name, number in {"CHECK_SPP": 2, "MIN_ALLOWED_LEVELS": 50.0, "MAX_MARGIN_BIAS": 50.0}.items():
         monkeypatch.setattr(acceptance, name, number)
     made, make = list[SurfaceRenderer](), SurfaceRenderer.__init__
 
