@@ -260,6 +260,8 @@ def make_things(
 
 
 def make_thing(number: int, image: int, thing: Any, category: int) -> dict[str, Any]:
+    """Return the annotation of a thing in COCO's JSON, with its mask as runs."""
+    fraction = thing.visible_fraction
     return {
         "id": number,
         "image_id": image,
@@ -271,8 +273,8 @@ def make_thing(number: int, image: int, thing: Any, category: int) -> dict[str, 
             "counts": [*find_runs(thing.mask)],
         },
         "iscrowd": 0,
-        "visible_share": None if thing.share is None else round(thing.share, 4),
-        "truncated": thing.truncated,
+        "visible_share": None if fraction is None else round(fraction, 4),
+        "truncated": thing.is_truncated,
         "name": thing.name,
         "distance": round(thing.distance, 4),
     }
