@@ -23,37 +23,41 @@ def copied(value: Value) -> Value:
     nobody can write into and that makes its values on demand.
     """
     original: Any = value
-    made: Any = original
+    copy_of_value: Any = original
     if hasattr(original, "requires_grad"):
-        made = original.clone()
+        copy_of_value = original.clone()
     elif isinstance(original, np.ndarray):
-        made = original.copy()
+        copy_of_value = original.copy()
     elif isinstance(original, MutableMapping):
-        made = copy.copy(original)
-        made.update({key: copied(inner) for key, inner in original.items()})
+        copy_of_value = copy.copy(original)
+        copy_of_value.update({key: copied(inner) for key, inner in original.items()})
     elif isinstance(original, MappingProxyType):
-        made = MappingProxyType({key: copied(inner) for key, inner in original.items()})
+        copy_of_value = MappingProxyType(
+            {key: copied(inner) for key, inner in original.items()}
+        )
     elif isinstance(original, list):
-        made = copy.copy(original)
-        made[:] = map(copied, original)
+        copy_of_value = copy.copy(original)
+        copy_of_value[:] = map(copied, original)
     elif isinstance(original, tuple):
-        parts = map(copied, original)
-        made = (
-            type(original)(*parts)
+        copied_items = map(copied, original)
+        copy_of_value = (
+            type(original)(*copied_items)
             if hasattr(original, "_fields")
-            else type(original)(parts)
+            else type(original)(copied_items)
         )
     elif isinstance(original, SimpleNamespace):
-        made = SimpleNamespace(**copied(vars(original)))
+        copy_of_value = SimpleNamespace(**copied(vars(original)))
     elif (
         is_dataclass(original)
         and not isinstance(original, type)
         and not getattr(original, "gives_copies", False)
     ):
-        made = copy.copy(original)
+        copy_of_value = copy.copy(original)
         for field in fields(original):
-            object.__setattr__(made, field.name, copied(getattr(original, field.name)))
-    return made  # type: ignore[no-any-return]
+            object.__setattr__(
+                copy_of_value, field.name, copied(getattr(original, field.name))
+            )
+    return copy_of_value  # type: ignore[no-any-return]
 
 
 def is_ours(kind: type) -> bool:
@@ -61,23 +65,23 @@ def is_ours(kind: type) -> bool:
     return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
 
 
-def hand_copies(kind: type, **places: slice) -> None:
+def hand_copies(kind: type, **argument_slices: slice) -> None:
     """Have methods that a class outside of this package defines called with copies of
     their arguments: by name, of which after `self`, and of all by keyword.
     """
     if is_ours(kind):
         return
-    for name, which in places.items():
+    for name, argument_slice in argument_slices.items():
         method = vars(kind).get(name)
         if isinstance(method, FunctionType):
-            setattr(kind, name, _handing(method, which))
+            setattr(kind, name, _handing(method, argument_slice))
 
 
 def _handing(method: Callable[..., Any], which: slice) -> Callable[..., Any]:
     @wraps(method)
     def handed(self: Any, *args: Any, **named: Any) -> Any:
-        handed_on = [*args]
-        handed_on[which] = map(copied, handed_on[which])
-        return method(self, *handed_on, **copied(named))
+        copied_args = [*args]
+        copied_args[which] = map(copied, copied_args[which])
+        return method(self, *copied_args, **copied(named))
 
     return handed

@@ -1,10 +1,10 @@
 """The one tree of errors that a user can cause.
 
-Every message says what was expected, what was got and what to do, and names the file or the setting as Python has it:
-``epsilon: ...`` at its beginning, and in backticks elsewhere, as in "use
-`denoise=none`" or "`grid` pose.yaw". The command line writes flags instead
-(`cli.flags.with_flags`) in one line on standard error, with exit status 2; anything but
-an `AdvsearchError` is a bug and keeps its traceback.
+Every message says what was expected, what was got and what to do, and names the file or
+the setting as Python has it: ``epsilon: ...`` at its beginning, and in backticks
+elsewhere, as in "use `denoise=none`" or "`grid` pose.yaw". The command line writes flags
+instead (`cli.flags.with_flags`) in one line on standard error, with exit status 2;
+anything but an `AdvsearchError` is a bug and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -96,18 +96,20 @@ def resembling(name: str, known: Iterable[str]) -> list[str]:
     of equals, those with fewer other words, and with its last word last. Where there is
     none, those of nearly the same spelling, as a whole or in one word.
     """
-    asked = _words(name)
+    query_words = _words(name)
     names = list(dict.fromkeys(known))
     ranks = {
         known: rank
         for known in names
-        if (rank := _rank(asked, _words(known))) is not None
+        if (rank := _rank(query_words, _words(known))) is not None
     }
     if ranks:
         return sorted(ranks, key=ranks.__getitem__)
     matcher = difflib.SequenceMatcher(None, "", name.casefold())
-    near = {known: _similarity(matcher, known) for known in names}
-    return sorted(filter(near.get, names), key=lambda known: -near[known])
+    similarities = {known: _similarity(matcher, known) for known in names}
+    return sorted(
+        filter(similarities.get, names), key=lambda known: -similarities[known]
+    )
 
 
 def _words(name: str) -> list[str]:
@@ -118,34 +120,34 @@ def _words(name: str) -> list[str]:
     ]
 
 
-def _rank(asked: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] | None:
+def _rank(query: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] | None:
     """Where a name with these words stands among those that are like what was asked
     for; None if it isn't.
     """
-    if not asked or not words:
+    if not query or not words:
         return None
-    place = len(words) - len(asked), words[-1] != asked[-1]
-    if set(asked) <= set(words):
-        return (0, *place)
-    if all(any(word.startswith(part) for word in words) for part in asked):
-        return (1, *place)
-    return (2, *place) if "".join(asked) in "".join(words) else None
+    preference = len(words) - len(query), words[-1] != query[-1]
+    if set(query) <= set(words):
+        return (0, *preference)
+    if all(any(word.startswith(query_word) for word in words) for query_word in query):
+        return (1, *preference)
+    return (2, *preference) if "".join(query) in "".join(words) else None
 
 
-def _similarity(asked: difflib.SequenceMatcher[str], name: str) -> float:
+def _similarity(matcher: difflib.SequenceMatcher[str], name: str) -> float:
     """How near a name's spelling is to what was asked for, as a whole or in one word; 0
     where it is not.
     """
-    best = 0.0
-    for text, least in [
+    best_ratio = 0.0
+    for text, threshold in [
         (name.casefold(), SIMILAR),
         *((word, SIMILAR_WORD) for word in _words(name)),
     ]:
-        asked.set_seq1(text)
+        matcher.set_seq1(text)
         if (
-            asked.real_quick_ratio() >= least
-            and asked.quick_ratio() >= least
-            and asked.ratio() >= least
+            matcher.real_quick_ratio() >= threshold
+            and matcher.quick_ratio() >= threshold
+            and matcher.ratio() >= threshold
         ):
-            best = max(best, asked.ratio())
-    return best
+            best_ratio = max(best_ratio, matcher.ratio())
+    return best_ratio

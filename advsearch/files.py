@@ -38,8 +38,12 @@ def split_paths(name: str) -> list[str]:
     as it is.
     """
     first, _, second = name.partition("+")
-    camera, thing = (one.lower().endswith(PATH_ENDINGS) for one in (first, second))
-    both = (
-        second and (camera or (thing and "/" not in first)) and not os.path.isfile(name)
+    is_camera_path, is_object_path = (
+        part.lower().endswith(PATH_ENDINGS) for part in (first, second)
     )
-    return [first, second] if both else [name]
+    has_two_paths = (
+        second
+        and (is_camera_path or (is_object_path and "/" not in first))
+        and not os.path.isfile(name)
+    )
+    return [first, second] if has_two_paths else [name]

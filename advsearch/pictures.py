@@ -35,12 +35,12 @@ def without_pillows_limit() -> Iterator[None]:
     """Let Pillow open, but not decode, pictures of any size: what is decoded is up to
     `check_pixels`.
     """
-    kept = Image.MAX_IMAGE_PIXELS
+    pixel_limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None
     try:
         yield
     finally:
-        Image.MAX_IMAGE_PIXELS = kept
+        Image.MAX_IMAGE_PIXELS = pixel_limit
 
 
 def check_pixels(
@@ -104,11 +104,11 @@ def upright(path: Path, side: int) -> npt.NDArray[np.float32]:
     """
     with opened(path, LARGEST_FILE) as image:
         check_decodable(image, path)
-        turned = ImageOps.exif_transpose(image)
-        shown = Image.fromarray(steps_of(turned, alpha=False))
-        if max(shown.size) > side:
-            shown.thumbnail((side, side), Image.Resampling.BOX)
-        values: npt.NDArray[np.float32] = np.asarray(shown, np.float32) / np.float32(
+        rotated = ImageOps.exif_transpose(image)
+        reduced = Image.fromarray(steps_of(rotated, alpha=False))
+        if max(reduced.size) > side:
+            reduced.thumbnail((side, side), Image.Resampling.BOX)
+        values: npt.NDArray[np.float32] = np.asarray(reduced, np.float32) / np.float32(
             255.0
         )
         return values
@@ -139,8 +139,8 @@ def _scans(image: Image.Image) -> int:
     file = getattr(image, "fp", None)
     if file is None:
         return 0
-    place = file.tell()
+    position = file.tell()
     file.seek(0)
     count = int(file.read().count(b"\xff\xda"))
-    file.seek(place)
+    file.seek(position)
     return count

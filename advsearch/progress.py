@@ -64,7 +64,8 @@ class Stages:
         self.progress = progress
         self.seconds: dict[str, float] = {}
         self._name = ""
-        self._started = self._begun = time.perf_counter()
+        self._started = time.perf_counter()
+        self._stage_started = self._started
 
     def begin(
         self,
@@ -79,13 +80,16 @@ class Stages:
         The rest: `Progress.stage`.
         """
         self.end()
-        self._name, self._begun = name, time.perf_counter()
+        self._name = name
+        self._stage_started = time.perf_counter()
         self.progress.stage(title, total, hint=hint, at_most=at_most)
 
     def end(self) -> None:
         if self._name:
             self.seconds[self._name] = (
-                self.seconds.get(self._name, 0.0) + time.perf_counter() - self._begun
+                self.seconds.get(self._name, 0.0)
+                + time.perf_counter()
+                - self._stage_started
             )
             self._name = ""
 
@@ -151,11 +155,11 @@ def shows_progress(function: Function) -> Function:
     """Let a function with a keyword `progress` be called with what `watched` takes."""
 
     @wraps(function)
-    def shown(*args: Any, progress: Watched = None, **named: Any) -> Any:
+    def wrapper(*args: Any, progress: Watched = None, **keywords: Any) -> Any:
         with watched(progress) as watcher:
-            return function(*args, progress=watcher, **named)
+            return function(*args, progress=watcher, **keywords)
 
-    return shown  # type: ignore[return-value]
+    return wrapper  # type: ignore[return-value]
 
 
 class LineProgress:
@@ -170,19 +174,19 @@ class LineProgress:
         written: Callable[[str], str] = str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._stream, self._written, self._clock, self._lock = (
-            stream,
-            written,
-            clock,
-            threading.RLock(),
-        )
+        self._stream = stream
+        self._written = written
+        self._clock = clock
+        self._lock = threading.RLock()
         self._ended = threading.Event()
         self._name = ""
         self._begin = ""
         self._info = ""
         self._total: int | None = None
         self._printed: float | None = None
-        self._at_most, self._done, self._began = False, 0, clock()
+        self._at_most = False
+        self._done = 0
+        self._began = clock()
 
     def stage(
         self,
@@ -197,12 +201,10 @@ class LineProgress:
             self._total = total
             self._at_most = at_most
             self._begin = name + (f": {self._written(hint)}" if hint else "")
-            self._done, self._info, self._began, self._printed = (
-                0,
-                "",
-                self._clock(),
-                None,
-            )
+            self._done = 0
+            self._info = ""
+            self._began = self._clock()
+            self._printed = None
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         with self._lock:
@@ -229,24 +231,24 @@ class LineProgress:
                 self._print(f"{self._name}: {self._far()}")
 
     def _far(self) -> str:
-        # 12 of at most 40, 10 s, at most 25 s left, best 0.31
+        """Return how far it is: ``12 of at most 40, 10 s, at most 25 s left, best
+        0.31``.
+        """
         done = self._done
         total = self._total
         elapsed = self._clock() - self._began
-        most = "at most " if self._at_most else ""
-        parts = [
-            f"{done} of {most}{total}"
-            if total is not None
-            else f"{done} done"
-            if done
-            else ""
-        ]
+        limit = "at most " if self._at_most else ""
+        texts = []
+        if total is not None:
+            texts.append(f"{done} of {limit}{total}")
+        elif done:
+            texts.append(f"{done} done")
         times = _seconds(elapsed)
         # below a tenth of an upper bound nothing is said of what is left: most such
         # stages end long before
         if total and 0 < done < total and not (self._at_most and 10 * done < total):
-            times += f", {most}{_seconds(elapsed / done * (total - done))} left"
-        return ", ".join(filter(None, [*parts, times, self._info]))
+            times += f", {limit}{_seconds(elapsed / done * (total - done))} left"
+        return ", ".join(filter(None, [*texts, times, self._info]))
 
     def _print(self, text: str) -> None:
         print(f"advsearch: {text}", file=self._stream, flush=True)
@@ -272,14 +274,14 @@ class NotebookProgress(LineProgress):
 
     def __init__(self, written: Callable[[str], str] = str) -> None:
         super().__init__(sys.stdout, written)
-        self._drawn = 0.0
+        self._updated = 0.0
         display = sys.modules["IPython"].display.display
         self._handle = display({"text/plain": ""}, raw=True, display_id=True)
 
     def tick(self) -> None:
         with self._lock:
-            if self._clock() - self._drawn >= UPDATE:
-                self._drawn = self._clock()
+            if self._clock() - self._updated >= UPDATE:
+                self._updated = self._clock()
                 self._handle.update(
                     {"text/plain": f"{self._name}, {self._far()}"}, raw=True
                 )
@@ -381,19 +383,16 @@ def escaped(text: str, encoding: str = "utf-8") -> str:
     """Return `text` with everything but line ends and tabs that a terminal would not
     show, or that would steer it, written as an escape: names in it are others'.
     """
-
-    def shown(sign: str) -> str:
-        if sign in "\n\t" or sign.isprintable() or unicodedata.category(sign) == "Zs":
-            return sign
-        code = ord(sign)
-        return (
-            f"\\x{code:02x}"
-            if code < 0x100
-            else f"\\u{code:04x}"
-            if code < 0x10000
-            else f"\\U{code:08x}"
-        )
-
     if not text.isascii() or not text.isprintable():
-        text = "".join(map(shown, text))
+        text = "".join(map(_escape_char, text))
     return text.encode(encoding, "backslashreplace").decode(encoding)
+
+
+def _escape_char(char: str) -> str:
+    """Return a character as it is if a terminal shows it, else as Python escapes it."""
+    if char in "\n\t" or char.isprintable() or unicodedata.category(char) == "Zs":
+        return char
+    code = ord(char)
+    if code < 0x100:
+        return f"\\x{code:02x}"
+    return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"

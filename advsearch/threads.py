@@ -87,7 +87,9 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
     for_torch = max(1, _chosen // 2) if rendering else _chosen
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(for_torch)
-    else:  # read when torch is imported later; not otherwise, because child processes would inherit it
+    else:
+        # read when torch is imported later; not otherwise, because child processes would
+        # inherit it
         os.environ["OMP_NUM_THREADS"] = str(for_torch)
     if "drjit" in sys.modules:
         apply_to_drjit()

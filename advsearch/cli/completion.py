@@ -66,11 +66,11 @@ def completion(args: argparse.Namespace) -> int:
             if named and flag not in OR_A_FILE:
                 action.choices = named
                 continue
-            ways: dict[str, Any] = shtab.FILE
+            completer: dict[str, Any] = shtab.FILE
             if named:  # or a file
                 function = f"_advsearch{flag.replace('-', '_')}"
                 words = " ".join(named)
-                ways = {
+                completer = {
                     "preamble": {
                         "bash": f'{function}() {{ compgen -W "{words}" -- '
                         f'"$1"; compgen -f -- "$1"; }}'
@@ -79,7 +79,7 @@ def completion(args: argparse.Namespace) -> int:
                     "zsh": f"_alternative 'names:name:({words})' 'files:file:_files'",
                     "tcsh": "f",
                 }
-            action.complete = ways  # type: ignore[attr-defined]  # where shtab looks for it
+            action.complete = completer  # type: ignore[attr-defined]  # where shtab looks for it
     script = shtab.complete(parser, shell=args.shell)
     return output.say(
         args.json,

@@ -271,27 +271,31 @@ def _reinstall(name: str) -> str:
 
 def check_llvm() -> Component:
     """The libLLVM that will be used, what else there is, and why that is not used."""
-    given = os.environ.get(llvm.ENVIRONMENT_VARIABLE, "")
+    library_setting = os.environ.get(llvm.ENVIRONMENT_VARIABLE, "")
     others = llvm.find_libraries()
     try:
         chosen = llvm.ensure_llvm()
     except AdvsearchError as error:
         fix = (
             f"unset {llvm.ENVIRONMENT_VARIABLE}"
-            if given
+            if library_setting
             else (
                 f"{llvm.get_install_command()} (or name a file in {llvm.ENVIRONMENT_VARIABLE})"
             )
         )
         return Component(
-            "libLLVM", "", BROKEN if others or given else MISSING, str(error), fix
+            "libLLVM",
+            "",
+            BROKEN if others or library_setting else MISSING,
+            str(error),
+            fix,
         )
     refused = [str(c) for c in others if c.refusal]
     usable = [
         str(c) for c in others if not c.refusal and c.path != chosen.path.resolve()
     ]
     detail = f"chosen: {chosen.path}" + (
-        f", named by {llvm.ENVIRONMENT_VARIABLE}" if given else ""
+        f", named by {llvm.ENVIRONMENT_VARIABLE}" if library_setting else ""
     )
     detail += f"; also usable: {', '.join(usable)}" if usable else ""
     detail += f"; refused: {', '.join(refused)}" if refused else ""

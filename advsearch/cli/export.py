@@ -8,6 +8,7 @@ import argparse
 import io
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from advsearch.cli import output
@@ -16,7 +17,7 @@ from advsearch.cli.output import output_errors
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.export import FORMATS, write_rows
-from advsearch.runs.exporters import EXPORTERS
+from advsearch.runs.exporters import EXPORTERS, Exporter
 from advsearch.runs.store import NAME, Store
 
 OPTIONS = ("all", "size", "sheets", "paper", "icc")
@@ -39,52 +40,57 @@ def _begin_lower(sentence: str) -> str:
 @command(
     argument("run", metavar="RUN", help="a run's name or folder"),
     _add_format,
-    argument("--out", metavar="FILE", help="the file to write (default: standard "
-                                           "output)"),
-    argument("--json", action="store_true", help="the same as --format json; with "
-                                                 "--out, tell what was written"),
-    argument("--kind", help="only rows of this kind: search, baseline, sweep, ... "
-                            "(default: all)"),
     argument(
-        "--size", metavar="MM", type=float,
-        help="print: the real object's longest side in millimetres (default: its own "
-             "where that is known, or 100)",
+        "--out", metavar="FILE", help="the file to write (default: standard output)"
     ),
     argument(
-        "--sheets", metavar="N", type=int, help="print: sheets that may be written; "
-                                                "more are refused (default: 200)"
+        "--json",
+        action="store_true",
+        help="the same as --format json; with --out, tell what was written",
+    ),
+    argument(
+        "--kind",
+        help="only rows of this kind: search, baseline, sweep, ... (default: all)",
+    ),
+    argument(
+        "--size",
+        metavar="MM",
+        type=float,
+        help="print: the real object's longest side in millimetres (default: its own "
+        "where that is known, or 100)",
+    ),
+    argument(
+        "--sheets",
+        metavar="N",
+        type=int,
+        help="print: sheets that may be written; more are refused (default: 200)",
     ),
     argument("--paper", help="print: a4, a3 or letter (default: a4)"),
     argument(
-        "--all", action="store_true", default=None,
+        "--all",
+        action="store_true",
+        default=None,
         help="coco, yolo: right predictions too (default: pictures that a model is "
-             "wrong about)",
+        "wrong about)",
     ),
     output.add_code_flag,
-    argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer "
-                                           "(default: sRGB)"),
+    argument(
+        "--icc",
+        metavar="FILE",
+        help="print: ICC profile of an RGB printer (default: sRGB)",
+    ),
     examples=(
         "export mug-texture-001",
         "export runs/mug-texture-001 --kind search --out search.parquet",
         *(EXPORTERS[name].example for name in EXPORTERS.built_ins),
     ),
-)  # fmt: skip
+)
 def export(args: argparse.Namespace) -> int:
+    """Write what the arguments of `export` ask for, and return the exit status."""
     out = None if args.out is None else Path(args.out)
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     usable = EXPORTERS.list_usable()
-    suffixes = {table: table for table in FORMATS}
-    for name, usable_exporter in usable.items():
-        # a package takes none of ours
-        suffixes.setdefault(usable_exporter.suffix or name, name)
-    format = args.format or suffixes.get(by_name, by_name)
-    if format == "fiftyone":
-        raise InputError(
-            "--format: fiftyone was removed, since FiftyOne reads COCO; "
-            "use --format coco"
-        )
-    if args.format and format not in (*EXPORTERS, *FORMATS):
-        raise UnknownNameError("format", format, (*EXPORTERS, *FORMATS))
+    format = _choose_format(args, by_name, usable)
     for option in OPTIONS:
         owners = [
             name for name, exporter in usable.items() if option in exporter.options
@@ -107,15 +113,33 @@ def export(args: argparse.Namespace) -> int:
     return output.say(args.json, facts, exported.text, sys.stderr)
 
 
+def _choose_format(
+    args: argparse.Namespace, by_name: str, usable: Mapping[str, type[Exporter]]
+) -> str:
+    """Return the format that is asked for, by name or by the suffix of the file.
+
+    Raises:
+        InputError: it was removed.
+        UnknownNameError: there is no such format.
+    """
+    format_of_suffix = {table: table for table in FORMATS}
+    for name, exporter in usable.items():
+        # a package takes none of ours
+        format_of_suffix.setdefault(exporter.suffix or name, name)
+    format: str = args.format or format_of_suffix.get(by_name, by_name)
+    if format == "fiftyone":
+        raise InputError(
+            "--format: fiftyone was removed, since FiftyOne reads COCO; "
+            "use --format coco"
+        )
+    if args.format and format not in (*EXPORTERS, *FORMATS):
+        raise UnknownNameError("format", format, (*EXPORTERS, *FORMATS))
+    return format
+
+
 def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
-    otherwise = (
-        by_name
-        if by_name in FORMATS
-        else "json"
-        if args.json and out is None
-        else "csv"
-    )
-    format = args.format or otherwise
+    """Write the rows of a run as a table to a file, or print them."""
+    format = args.format or _choose_table_format(args, out, by_name)
     if args.json and out is None and format != "json":
         raise InputError(
             f"--json: prints JSON, but --format asks for {format}; leave "
@@ -142,3 +166,12 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
     text = f"{count} rows in {out}" + ("" if by_name == format else f", as {format}")
     facts = {"command": "export", "rows": count, "format": format, "out": str(out)}
     return output.say(args.json, facts, text, sys.stderr)
+
+
+def _choose_table_format(
+    args: argparse.Namespace, out: Path | None, by_name: str
+) -> str:
+    """Return the format of a table by the name of its file; CSV if that says nothing."""
+    if by_name in FORMATS:
+        return by_name
+    return "json" if args.json and out is None else "csv"

@@ -5,6 +5,7 @@ searched; and `import-3db`.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,84 +68,123 @@ def file(args: argparse.Namespace) -> int:
 
 
 def _mesh_file(file: str, inside: Contents) -> Understood:
-    whole = inside.object
-    nodes = inside.nodes
-    rig = inside.object.mesh.rig
-    materials = {name: len(faces) for name, faces in whole.mesh.materials.items()}
-    width, height = whole.base_color.shape[1::-1]
-    up = None if whole.up is None else whole.up.axis
-    front = None if whole.front is None else whole.front.axis
-    clips, moved = (
-        (list(rig.clips), list(rig.defaults)) if rig is not None else ([], [])
-    )
-    joints = [name.removesuffix(".x") for name in moved if name.endswith(".x")]
-    targets = [
-        name.removesuffix(".weight") for name in moved if name.endswith(".weight")
-    ]
-    features = {
-        "what it lets light through": whole.opacity,
-        "its normal map": whole.normal_map,
+    """Return what the file of a mesh contains, as facts for JSON and as lines of text."""
+    material_sizes = {
+        name: len(faces) for name, faces in inside.object.mesh.materials.items()
     }
-    features["its emission"] = whole.emission
-    held = [name for name, feature in features.items() if feature is not None]
-    slow = held and [
-        f"slow: for {either(held, 'and')}, controls that move outlines (pose, camera, "
-        "geometry) are differentiated by "
-        "differences, which takes several renders a step; textures and light are not "
-        "slower"
-    ]
+    clips, joints, targets = _list_motions(inside.object.mesh.rig)
+    slow = _explain_slow_features(inside.object)
     facts = {
-        "triangles": len(whole.mesh.faces),
-        "texture": [width, height],
-        "up": up,
-        "front": front,
+        **_describe_object(inside.object),
         "materials": [
-            {"name": name, "triangles": count} for name, count in materials.items()
+            {"name": name, "triangles": count} for name, count in material_sizes.items()
         ],
-        "nodes": [
-            {
-                "name": n.name,
-                "mesh": n.mesh_name,
-                "triangles": n.triangles,
-                "size": list(n.size),
-            }
-            for n in nodes
-        ],
+        "nodes": list(map(_describe_node, inside.nodes)),
         "lights": list(inside.lights),
         "cameras": list(inside.cameras),
-        **{"clips": clips, "joints": joints, "targets": targets},
+        "clips": clips,
+        "joints": joints,
+        "targets": targets,
         "slow": slow,
-        "warnings": list(whole.warnings),
+        "warnings": list(inside.object.warnings),
     }
+    width, height = facts["texture"]
     lines = [
-        f"{file}: {len(whole.mesh.faces):,} triangles, a texture of {width} x "
-        f"{height}, {up} up, front {front}"
+        f"{file}: {facts['triangles']:,} triangles, a texture of {width} x {height}, "
+        f"{facts['up']} up, front {facts['front']}"
     ]
-    if nodes:
-        sizes = [" x ".join(f"{side:.3g}" for side in node.size) for node in nodes]
-        rows = [
-            [n.name, n.mesh_name, f"{n.triangles:,} triangles", size]
-            for n, size in zip(nodes, sizes, strict=True)
-        ]
-        lines.append(output.aligned([["node", "in controls", "", "size"], *rows]))
-        lines.append(
-            "One of them as the object, the rest around it: --object "
-            f"'{file}#{nodes[-1].name}'"
-        )
-        if len(nodes) > 1:
-            lines.append(
-                f"Another one moves with it: --control pose,pose:{nodes[0].mesh_name}"
-            )
-    listed = {
-        "materials (--control 'texture={materials: [NAME]}')": materials,
+    if inside.nodes:
+        lines += _format_nodes(file, inside.nodes)
+    names_by_kind = {
+        "materials (--control 'texture={materials: [NAME]}')": material_sizes,
         "lights": inside.lights,
         "cameras (--camera NAME)": inside.cameras,
         "clips (--control 'body={clip: NAME, time: [0, 1]}')": clips,
         "joints (--control 'body={NAME.x: [-30, 30]}')": joints,
         "morph targets (--control 'body={NAME.weight: [0, 1]}')": targets,
     }
-    lines += [f"{what}: {', '.join(names)}" for what, names in listed.items() if names]
-    return facts, lines + [f"Note: {note}" for note in (*whole.warnings, *slow)]
+    lines += _format_names(names_by_kind)
+    lines += [f"Note: {note}" for note in (*inside.object.warnings, *slow)]
+    return facts, lines
+
+
+def _format_names(names_by_kind: Mapping[str, Iterable[str]]) -> list[str]:
+    """Return a line for each kind of which there are names."""
+    return [
+        f"{kind}: {', '.join(names)}" for kind, names in names_by_kind.items() if names
+    ]
+
+
+def _describe_node(node: Any) -> dict[str, Any]:
+    """Return names and size of a node, for JSON."""
+    return {
+        "name": node.name,
+        "mesh": node.mesh_name,
+        "triangles": node.triangles,
+        "size": list(node.size),
+    }
+
+
+def _describe_object(mesh_object: Any) -> dict[str, Any]:
+    """Return size and orientation of an object, for JSON."""
+    width, height = mesh_object.base_color.shape[1::-1]
+    up = mesh_object.up
+    front = mesh_object.front
+    return {
+        "triangles": len(mesh_object.mesh.faces),
+        "texture": [width, height],
+        "up": None if up is None else up.axis,
+        "front": None if front is None else front.axis,
+    }
+
+
+def _list_motions(rig: Any) -> tuple[list[str], list[str], list[str]]:
+    """Return the names of clips, joints and morph targets of a rig, if there is one."""
+    if rig is None:
+        return [], [], []
+    joints = [name.removesuffix(".x") for name in rig.defaults if name.endswith(".x")]
+    targets = [
+        name.removesuffix(".weight")
+        for name in rig.defaults
+        if name.endswith(".weight")
+    ]
+    return list(rig.clips), joints, targets
+
+
+def _explain_slow_features(mesh_object: Any) -> list[str]:
+    """Return a sentence about features that make gradients slow; none without them."""
+    features = {
+        "what it lets light through": mesh_object.opacity,
+        "its normal map": mesh_object.normal_map,
+        "its emission": mesh_object.emission,
+    }
+    names = [name for name, feature in features.items() if feature is not None]
+    if not names:
+        return []
+    return [
+        f"slow: for {either(names, 'and')}, controls that move outlines (pose, camera, "
+        "geometry) are differentiated by "
+        "differences, which takes several renders a step; textures and light are not "
+        "slower"
+    ]
+
+
+def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
+    """Return a table of the nodes of a file, and how one becomes the object."""
+    rows = [["node", "in controls", "", "size"]]
+    for node in nodes:
+        size = " x ".join(f"{length:.3g}" for length in node.size)
+        rows.append([node.name, node.mesh_name, f"{node.triangles:,} triangles", size])
+    lines = [
+        output.aligned(rows),
+        "One of them as the object, the rest around it: --object "
+        f"'{file}#{nodes[-1].name}'",
+    ]
+    if len(nodes) > 1:
+        lines.append(
+            f"Another one moves with it: --control pose,pose:{nodes[0].mesh_name}"
+        )
+    return lines
 
 
 def _mitsuba_file(file: str, out: Path | None) -> Understood:
@@ -154,11 +194,11 @@ def _mitsuba_file(file: str, out: Path | None) -> Understood:
     inside = read_contents(Path(file))
     warnings: tuple[str, ...] = ()
     if inside.objects:
-        plain = next(
+        object_name = next(
             (name for name in inside.objects if name not in inside.lights),
             inside.objects[0],
         )
-        scene = advsearch.load_scene(plain, scene=file)
+        scene = advsearch.load_scene(object_name, scene=file)
         warnings = scene.description.object.warnings
         if out is not None:
             advsearch.render(scene, resolution=2 * SIDE).save(out)
@@ -167,21 +207,27 @@ def _mitsuba_file(file: str, out: Path | None) -> Understood:
             f"{file}: no shape of it can be the object, so that it cannot "
             "be pictured; leave --out out"
         )
-    kept = dict(inside.unchanged)
-    listed = {
+    unchanged_shapes = dict(inside.unchanged)
+    names_by_kind = {
         "objects": list(inside.objects),
-        "kept": [f"{name} ({why})" for name, why in kept.items()],
+        "kept": [f"{name} ({why})" for name, why in unchanged_shapes.items()],
     }
-    listed |= {"lights": list(inside.lights), "cameras": list(inside.cameras)}
+    names_by_kind |= {"lights": list(inside.lights), "cameras": list(inside.cameras)}
     lines = [f"{file}: a Mitsuba scene"]
-    lines += [f"{what}: {', '.join(names)}" for what, names in listed.items() if names]
+    lines += [
+        f"{what}: {', '.join(names)}" for what, names in names_by_kind.items() if names
+    ]
     if inside.objects:
         lines.append(
             f"One of them as the object, the rest around it: --scene {file} "
             f"--object {inside.objects[-1]}"
         )
     lines += [f"Note: {warning}" for warning in warnings]
-    return {**listed, "kept": kept, "warnings": list(warnings)}, lines
+    return {
+        **names_by_kind,
+        "kept": unchanged_shapes,
+        "warnings": list(warnings),
+    }, lines
 
 
 def _describe(parser: argparse.ArgumentParser) -> None:

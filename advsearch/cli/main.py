@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from advsearch.experiment import Experiment
     from advsearch.settings import Config
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # The commands: what the help lists, and what carries each out.
 #
 # An experiment's command is made from it (`advsearch.experiment.Experiment`). Others
@@ -174,9 +174,9 @@ class ExperimentCommand:
                 **read_defaults(find_run(run_name) / CONFIG, vars(args)),
             )
         missing = [
-            one.flag
-            for one in settings(config_type)
-            if one.required and one.field not in args
+            setting.flag
+            for setting in settings(config_type)
+            if setting.required and setting.field not in args
         ]
         if missing:
             command = f"advsearch {self.name}"

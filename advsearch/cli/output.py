@@ -91,15 +91,15 @@ def output_errors() -> Iterator[None]:
 @contextmanager
 def screens() -> Iterator[None]:
     """Let everything that is printed inside the block go through a `Screen`."""
-    before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = (
-        _screen(before[0], needed=True),
-        _screen(before[1], needed=False),
-    )
+    stdout = sys.stdout
+    stderr = sys.stderr
+    sys.stdout = _screen(stdout, needed=True)
+    sys.stderr = _screen(stderr, needed=False)
     try:
         yield
     finally:
-        sys.stdout, sys.stderr = before
+        sys.stdout = stdout
+        sys.stderr = stderr
 
 
 def raw(stream: IO[str]) -> IO[str]:
@@ -248,20 +248,20 @@ def output_kept_clean() -> Iterator[None]:
     output holds.
     """
     sys.stdout.flush()
-    kept: int | None = None
+    stdout_descriptor: int | None = None
     with suppress(OSError):  # where one of them is closed
-        kept = os.dup(1)
+        stdout_descriptor = os.dup(1)
         os.dup2(2, 1)
     try:
         with redirect_stdout(sys.stderr):
             yield
     finally:
-        if kept is not None:
+        if stdout_descriptor is not None:
             # what the C library holds back, before its descriptor changes
             with suppress(OSError, AttributeError):
                 ctypes.CDLL(None).fflush(None)
-            os.dup2(kept, 1)
-            os.close(kept)
+            os.dup2(stdout_descriptor, 1)
+            os.close(stdout_descriptor)
 
 
 def shown_text(result: Result) -> str:

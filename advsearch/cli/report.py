@@ -7,6 +7,7 @@ import csv
 import math
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,34 +75,19 @@ LARGEST_POSES = 1 << 20
     ),
 )
 def report(args: argparse.Namespace) -> int:
+    """Write page, Markdown and JSON about runs, and return the exit status."""
     # late, so that --help answers at once
     from advsearch.extend import directory, writing
     from advsearch.questions.report.evidence import collect_evidence, read_exposure
     from advsearch.questions.report.result import format_markdown, make_evidence_page
 
-    if not args.evidence:
-        raise InputError(
-            "report: expected --evidence, which writes the claims of all these runs; "
-            "the page of one run is "
-            "report.html in its folder"
-        )
     folder = Path(args.out)
-    names = [folder / f"{NAME}.{suffix}" for suffix in ("html", "md", "json")]
-    there = [name for name in names if name.exists()]
-    if there and not args.overwrite:
-        raise InputError(
-            f"{there[0]}: exists already; add --overwrite or choose "
-            "another folder with --out"
-        )
-    if args.criterion is not None and not 0.0 < args.criterion <= 1.0:
-        raise InputError(
-            "--criterion: expected a share over 0 and at most 1, such as "
-            f"0.9, got {args.criterion:g}"
-        )
+    output_paths = [folder / f"{NAME}.{suffix}" for suffix in ("html", "md", "json")]
+    _check_arguments(args, output_paths)
     exposure = {} if args.exposure is None else read_exposure(args.exposure)
     if args.photographs is not None:
         _take_in(args.photographs, args.runs[0])
-    evidence, pictures = collect_evidence(
+    evidence, images = collect_evidence(
         args.runs, criterion=args.criterion, exposure=exposure, by=args.by
     )
     try:
@@ -110,24 +96,52 @@ def report(args: argparse.Namespace) -> int:
         raise InputError(
             f"--out: cannot make the folder {folder}: {error.strerror}"
         ) from None
-    for name, data in pictures.items():
+    for name, data in images.items():
         writing.write_bytes(folder / name, data)
-    texts = (
-        make_evidence_page(evidence, pictures),
+    contents = (
+        make_evidence_page(evidence, images),
         format_markdown(evidence),
         directory.summary.to_json(evidence) + "\n",
     )
-    for path, text in zip(names, texts, strict=True):
-        writing.write_text(path, text)
-    lines = [
-        text
-        for run in evidence.runs
-        for text in (run.run, *(f"  {c.kind}: {c.statement}" for c in run.claims))
-    ]
-    notes = "".join(f"\nNote: {text}" for text in evidence.warnings)
-    return output.say(
-        args.json, evidence.to_dict(), "\n".join([*lines, notes, *map(str, names)])
-    )
+    for path, content in zip(output_paths, contents, strict=True):
+        writing.write_text(path, content)
+    text = _format_evidence(evidence, output_paths)
+    return output.say(args.json, evidence.to_dict(), text)
+
+
+def _format_evidence(evidence: Any, output_paths: Sequence[Path]) -> str:
+    """Return the claims of all runs, notes, and the paths of the files, as text."""
+    lines = []
+    for run in evidence.runs:
+        lines.append(run.run)
+        lines += [f"  {claim.kind}: {claim.statement}" for claim in run.claims]
+    notes = "".join(f"\nNote: {warning}" for warning in evidence.warnings)
+    return "\n".join([*lines, notes, *map(str, output_paths)])
+
+
+def _check_arguments(args: argparse.Namespace, output_paths: Sequence[Path]) -> None:
+    """Check the arguments of `report` before anything is read.
+
+    Raises:
+        InputError: one is missing or out of range, or a file exists already.
+    """
+    if not args.evidence:
+        raise InputError(
+            "report: expected --evidence, which writes the claims of all these runs; "
+            "the page of one run is "
+            "report.html in its folder"
+        )
+    existing_files = [path for path in output_paths if path.exists()]
+    if existing_files and not args.overwrite:
+        raise InputError(
+            f"{existing_files[0]}: exists already; add --overwrite or choose "
+            "another folder with --out"
+        )
+    if args.criterion is not None and not 0.0 < args.criterion <= 1.0:
+        raise InputError(
+            "--criterion: expected a share over 0 and at most 1, such as "
+            f"0.9, got {args.criterion:g}"
+        )
 
 
 def _take_in(folder: str, name: str) -> None:
@@ -140,17 +154,19 @@ def _take_in(folder: str, name: str) -> None:
     task: Any = (
         settings.read_yaml(run / directory.CONFIG).get("task") or "classification"
     )
-    with tempfile.TemporaryDirectory() as named:
-        place = Path(folder)
-        if (place / POSES).is_file():
-            place = _named_by_pose(place, run, Path(named))
+    with tempfile.TemporaryDirectory() as temporary_folder:
+        photograph_folder = Path(folder)
+        if (photograph_folder / POSES).is_file():
+            photograph_folder = _named_by_pose(
+                photograph_folder, run, Path(temporary_folder)
+            )
         photographs = workbench.load_photographs()
-        files = photographs.list_files(place, task)
-        if loose := [
+        files = photographs.list_files(photograph_folder, task)
+        if unnumbered_files := [
             file.name for file in files if not file.stem.startswith("rendering-")
         ]:
             raise InputError(
-                f"photographs: {loose[0]}: expected the number of a rendering in its "
+                f"photographs: {unnumbered_files[0]}: expected the number of a rendering in its "
                 "name, such as rendering-12.jpg, "
                 f"or {POSES} beside it; advsearch dashboard aligns photographs by phone"
             )
@@ -180,11 +196,11 @@ def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
         ),
         2,
     ):
-        where = f"photographs: {folder / POSES}, line {line}"
+        location = f"photographs: {folder / POSES}, line {line}"
         file = folder / Path(str(pose.pop("file", ""))).name
         if not file.is_file():
             raise InputError(
-                f"{where}: expected the name of a photograph beside it "
+                f"{location}: expected the name of a photograph beside it "
                 f"under `file`, got {file.name!r}"
             )
         steps = [
@@ -193,10 +209,10 @@ def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
             if all(_is_at(values.get(name), text) for name, text in pose.items())
         ]
         if len(steps) != 1:
-            told = ", ".join(f"{name} {text}" for name, text in pose.items())
+            pose_text = ", ".join(f"{name} {text}" for name, text in pose.items())
             raise InputError(
-                f"{where}: expected a pose that one rendering of {run.name} has, got "
-                f"{told}, which {len(steps)} have; "
+                f"{location}: expected a pose that one rendering of {run.name} has, got "
+                f"{pose_text}, which {len(steps)} have; "
                 "sweep a grid of the poses"
             )
         shutil.copyfile(file, out / f"rendering-{steps[0]}-{file.name}")

@@ -121,10 +121,12 @@ def resume(args: argparse.Namespace) -> int:
         raise InputError(
             f"{path}: expected a run with its {CONFIG}, got none; start it again"
         )
-    asked = command_in(path / CONFIG)
+    command = command_in(path / CONFIG)
     # the map of a sweep's surface, or a recipe's figures anew, with the photographs
     # that were taken since
-    adds = asked == "recipe" or (changes.get("surface") is True and asked == "sweep")
+    adds = command == "recipe" or (
+        changes.get("surface") is True and command == "sweep"
+    )
     if finished(path) and not adds:
         print(f"advsearch: {path} is done already", file=sys.stderr)
         # the disk was full as it was written, or it was removed

@@ -139,16 +139,18 @@ def _show_unfinished(run: Listed, as_json: bool) -> int:
     go_on = (
         output.go_on_command(run.path) if run.begun and run.state == "stopped" else None
     )
-    what = run.command
+    subject = run.command
     if run.object:
-        what += f" of {run.object}, {' and '.join(run.controls) or 'nothing searched'}"
-    how = {"running": "A process is working on it"}.get(
+        subject += (
+            f" of {run.object}, {' and '.join(run.controls) or 'nothing searched'}"
+        )
+    state_text = {"running": "A process is working on it"}.get(
         run.state, "It was stopped before its end"
     )
-    kept = ", ".join(f"{number} of {kind}" for kind, number in run.kinds.items())
+    row_counts = ", ".join(f"{number} of {kind}" for kind, number in run.kinds.items())
     lines = [
-        f"{run.name}: {what}.",
-        f"{how}; evaluations kept so far: {kept or 'none'}.",
+        f"{run.name}: {subject}.",
+        f"{state_text}; evaluations kept so far: {row_counts or 'none'}.",
     ]
     if go_on is not None:
         lines += ["", f"Go on with: {go_on}"]
@@ -199,10 +201,8 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
             options.append(
                 {"name": option, "type": get_option_type(field), "default": default}
             )
-        facts["options"], rows = (
-            options,
-            [{**option, "default": _cell(option["default"])} for option in options],
-        )
+        facts["options"] = options
+        rows = [{**option, "default": _cell(option["default"])} for option in options]
         how = f"options, as in --{kind} '{name}={{OPTION: VALUE}}':"
         parts.append(f"{how}\n{_table(rows)}" if rows else "It has no options.")
     return output.say(
@@ -211,25 +211,32 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
 
 
 def _of_parameter(parameter: Parameter) -> dict[str, str]:
+    """Return the row of a parameter in the table of its control, by column."""
     count = " x ".join("any" if side is None else str(side) for side in parameter.shape)
-    low, high = parameter.search or (0.0, 0.0)
-    searched = f"{low:g} to {high:g}" + (", log" if parameter.log else "")
+    allowed = ", ".join(parameter.options)
+    if not allowed:
+        allowed = f"{parameter.low:g} to {parameter.high:g}"
     return {
         "name": parameter.name,
         "unit": parameter.unit + (f" ({count})" if count else ""),
-        "allowed": ", ".join(parameter.options)
-        or f"{parameter.low:g} to {parameter.high:g}",
-        "searched": "if asked"
-        if parameter.search is None
-        else "all"
-        if parameter.options
-        else searched,
+        "allowed": allowed,
+        "searched": _searched_text(parameter),
         "default": _cell(parameter.default),
         "periodic": _cell(parameter.periodic),
         "moves outlines": _cell(parameter.moves_silhouettes),
         "derivative": "none" if parameter.options else ", ".join(parameter.estimators),
         "description": parameter.description,
     }
+
+
+def _searched_text(parameter: Parameter) -> str:
+    """Return the range of a parameter that a search covers."""
+    if parameter.search is None:
+        return "if asked"
+    if parameter.options:
+        return "all"
+    low, high = parameter.search
+    return f"{low:g} to {high:g}" + (", log" if parameter.log else "")
 
 
 def _of_choice(choice: Choice) -> dict[str, str]:
@@ -254,15 +261,12 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def _cell(value: JsonValue) -> str:
+    """Return a value as the text of a cell; None is empty."""
+    if value is None:
+        return ""
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return (
-        ""
-        if value is None
-        else f"{value:g}"
-        if isinstance(value, float)
-        else str(value)
-    )
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 HEIGHT = 16  # of a picture, in lines
@@ -325,7 +329,7 @@ def _drawing() -> tuple[Callable[[Path], None] | None, str]:
 
 
 # ---- names
-# -----------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 
 
 CASES = "cases"  # of `stability`, which are not among all names
@@ -434,27 +438,29 @@ def labels(args: argparse.Namespace) -> int:
             allow_named({"model": model})
             loaded = load_model(model)
             if not loaded.named:
-                what = f"model {loaded.name} has {loaded.classes} classes without names"
-                raise InputError(f"{what}; give a file with `labels`")
+                problem = (
+                    f"model {loaded.name} has {loaded.classes} classes without names"
+                )
+                raise InputError(f"{problem}; give a file with `labels`")
             names = loaded.labels
-        like = (
+        similar_indices = (
             range(len(names))
             if args.word is None
             else [index for index, _ in find_similar_labels(args.word, names)]
         )
-        asked = args.word is not None and is_nothing_name(args.word)
+        is_nothing_requested = args.word is not None and is_nothing_name(args.word)
         classes = {
             index: names[index]
-            for index in like
-            if asked or not is_nothing_name(names[index])
+            for index in similar_indices
+            if is_nothing_requested or not is_nothing_name(names[index])
         }
     if not classes:
         raise InputError(
             f"none of the {len(names)} labels is like {args.word!r}; "
             "leave the word out to see all"
         )
-    listed = [{"index": index, "label": name} for index, name in classes.items()]
+    entries = [{"index": index, "label": name} for index, name in classes.items()]
     text = output.aligned([[f"#{index}", name] for index, name in classes.items()])
     return output.say(
-        args.json, {"command": "labels", "word": args.word, "labels": listed}, text
+        args.json, {"command": "labels", "word": args.word, "labels": entries}, text
     )

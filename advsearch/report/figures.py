@@ -29,13 +29,25 @@ BLUE = "#1d5fd0"
 RED = "#b3261e"
 GREY = "#5c606a"
 STYLE: dict[Any, Any] = {
-    "font.family": ["DejaVu Sans"], "font.size": 9.0, "legend.frameon": False, "legend.fontsize": 8.0,
-    "axes.axisbelow": True, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": GREY,
-    "axes.labelcolor": "#1c1d20", "axes.titlelocation": "left", "axes.titlesize": 10.0, "axes.titleweight": "bold",
-    "grid.color": "#dfe0e3", "grid.linewidth": 0.7, "svg.hashsalt": "advsearch", "svg.fonttype": "none",
+    "font.family": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": "#1c1d20",
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10.0,
+    "axes.titleweight": "bold",
+    "grid.color": "#dfe0e3",
+    "grid.linewidth": 0.7,
+    "svg.hashsalt": "advsearch",
+    "svg.fonttype": "none",
     # names come from users: a dollar sign in one is no formula
     "text.parse_math": False,
-}  # fmt: skip
+}
 
 
 def new_axes() -> Any:
@@ -88,20 +100,29 @@ def draw_shares(
     series: Sequence[str],
     colours: Sequence[str] = SERIES,
 ) -> None:
-    """Draw a row for each name, in which a dot with its interval is the share of each
-    of the series; None is none.
+    """Draw the fractions of several series, with their intervals, as dots on rows.
+
+    Args:
+        axes: of matplotlib, on which it is drawn.
+        rows: by their labels, from the top; of each series a fraction in [0, 1] and
+            both bounds of its interval, or None, which is left out.
+        series: their names, for the legend.
+        colours: of the series; they repeat.
     """
-    for number, label in enumerate(series):
-        colour = colours[number % len(colours)]
-        mark = MARKS[number % len(MARKS)]
-        for row, shares in enumerate(rows.values()):
-            place = row + (number - (len(series) - 1) / 2) * min(
-                0.22, 0.8 / len(series)
-            )
-            if (drawn := shares[number]) is not None:
-                axes.plot(drawn[1], [place] * 2, color=colour, alpha=0.45, linewidth=3)
-                axes.plot(drawn[0], place, mark, color=colour, ms=5, label=label)
-                label = "_"  # a series has one line in the legend
+    spacing = min(0.22, 0.8 / len(series))
+    for index, label in enumerate(series):
+        colour = colours[index % len(colours)]
+        mark = MARKS[index % len(MARKS)]
+        offset = (index - (len(series) - 1) / 2) * spacing
+        for row, row_fractions in enumerate(rows.values()):
+            y = row + offset
+            fraction_and_interval = row_fractions[index]
+            if fraction_and_interval is None:
+                continue
+            fraction, interval = fraction_and_interval
+            axes.plot(interval, [y] * 2, color=colour, alpha=0.45, linewidth=3)
+            axes.plot(fraction, y, mark, color=colour, ms=5, label=label)
+            label = "_"  # a series has one line in the legend
     axes.set_yticks(range(len(rows)), list(rows))
     axes.set(xlim=(-0.03, 1.03), ylim=(len(rows) - 0.4, -0.6))
     axes.grid(True, axis="x")
@@ -113,34 +134,37 @@ def search_axes(
     axes: Any,
     zero_means: str = "",
 ) -> None:
-    """Draw searches on matplotlib axes, by their names: the best objective so far over
-    the evaluations, and each single one, None where it was not a number. The meaning is
-    the label of the vertical axis, and `zero_means` stands at the zero line, which is
-    not drawn where that is empty.
+    """Draw how the best objective of searches grows over their evaluations.
+
+    Args:
+        objectives: of each evaluation of each search, by the search's name; None where
+            it was not a number.
+        meaning: the label of the vertical axis.
+        axes: of matplotlib, on which it is drawn.
+        zero_means: the text at the zero line, which is left out if this is empty.
     """
     styles = cycle(((BLUE, "-"), (RED, (0.0, (4.0, 1.5))), (GREY, "-")))
     for (name, values), (colour, dashes) in zip(
         objectives.items(), styles, strict=False
     ):
-        each = np.array(values, dtype=float)  # None is NaN
-        best = np.fmax.accumulate(each) if len(each) else each
-        shown = np.unique(
-            np.linspace(0, len(each) - 1, min(len(each), MOST_POINTS))
-            .round()
-            .astype(int)
-        )
+        objective = np.array(values, dtype=float)  # None is NaN
+        best = np.fmax.accumulate(objective) if len(objective) else objective
+        indices = _select_points(len(objective))
         # a dot is a line without a length: all of them are one path, and a page stays
         # small
-        at, dots = (
-            np.stack([ends, ends, ends * np.nan], 1).ravel()
-            for ends in (shown + 1.0, each[shown])
+        dots_x = _as_dots(indices + 1.0)
+        dots_y = _as_dots(objective[indices])
+        axes.plot(
+            dots_x,
+            dots_y,
+            solid_capstyle="round",
+            linewidth=4,
+            alpha=0.35,
+            color=colour,
         )
         axes.plot(
-            at, dots, solid_capstyle="round", linewidth=4, alpha=0.35, color=colour
-        )
-        axes.plot(
-            shown + 1,
-            best[shown],
+            indices + 1,
+            best[indices],
             linestyle=dashes,
             linewidth=2,
             color=colour,
@@ -166,6 +190,17 @@ def search_axes(
     axes.legend()
 
 
+def _select_points(count: int) -> npt.NDArray[np.int_]:
+    """Return the indices of at most `MOST_POINTS` of the values, evenly spaced."""
+    positions = np.linspace(0, count - 1, min(count, MOST_POINTS))
+    return np.unique(positions.round().astype(int))
+
+
+def _as_dots(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return coordinates (3n,) of lines without a length at values (n,), with gaps."""
+    return np.stack([values, values, values * np.nan], 1).ravel()
+
+
 MARGIN = "margin [logits]; below 0: wrong"
 ACCURACY = "accuracy"
 """What the colours of a map may mean: red is wrong in both."""
@@ -187,11 +222,11 @@ def heat(
     if meaning == ACCURACY:
         colours: dict[str, str | float] = {"cmap": "RdBu", "vmin": 0.0, "vmax": 1.0}
     else:
-        largest = max([*finite, 1e-6])
-        colours = {"cmap": "RdBu", "vmin": -largest, "vmax": largest}
-    shown = axes.imshow(values, origin="lower", extent=extent, aspect="auto", **colours)
+        limit = max([*finite, 1e-6])
+        colours = {"cmap": "RdBu", "vmin": -limit, "vmax": limit}
+    image = axes.imshow(values, origin="lower", extent=extent, aspect="auto", **colours)
     axes.set(xlabel=across, ylabel=up)
-    axes.figure.colorbar(shown, ax=axes, label=meaning)
+    axes.figure.colorbar(image, ax=axes, label=meaning)
 
 
 def axis_title(name: str, unit: str) -> str:
@@ -203,7 +238,7 @@ def figure_of(draw: Callable[[Any], object], size: tuple[float, float]) -> Figur
     return drawn(lambda figure: draw(figure.subplots()), size)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # Pictures with something drawn into them, boxes and masks of what is true and what is
 # said; or several on a sheet.
 
@@ -238,109 +273,130 @@ def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
     image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
     for shape in sorted(shapes, key=lambda shape: shape.true):
         if shape.mask is not None:
-            mask = Image.fromarray(np.asarray(shape.mask, dtype=bool))
-            whole = np.asarray(mask.resize(size, Image.Resampling.NEAREST))
-            strength = whole * TINT
-            if shape.true:  # the outline alone, two pixels wide
-                far = np.pad(whole, 2)
-                inner = (
-                    whole
-                    & far[4:, 2:-2]
-                    & far[:-4, 2:-2]
-                    & far[2:-2, 4:]
-                    & far[2:-2, :-4]
-                )
-                strength = (whole & ~inner).astype(float)
-            colour = Image.new("RGB", size, TRUE if shape.true else SAID)
-            image.paste(
-                colour,
-                (0, 0),
-                Image.fromarray(np.rint(255.0 * strength).astype(np.uint8)),
-            )
-    draw = ImageDraw.Draw(image)
+            _draw_mask(image, shape)
     font = ImageFont.load_default(max(size) // LETTERS)
-    boxes = [
-        (shape, _corners(shape.box, factor, size))
-        for shape in shapes
-        if shape.box is not None
-    ]
-    for shape, ends in boxes:
-        draw.rectangle(ends, outline=TRUE if shape.true else SAID, width=2)
-    written: list[tuple[int, int, int, int]] = []
-    for shape, ends in boxes:
-        written.append(_write(draw, shape, ends, size, font, written))
-    maps = sorted(
-        (shape for shape in shapes if shape.map is not None),
-        key=lambda shape: not shape.true,
-    )
-    panels = [image]
-    for shape in maps:
-        low = float(maps[0].map.min())
-        high = float(maps[0].map.max())
-        greys = np.clip(
-            (np.asarray(shape.map, dtype=np.float64) - low) / max(high - low, 1e-12),
-            0.0,
-            1.0,
-        )
-        levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
-        panels.append(
-            Image.fromarray(levels)
-            .resize(size, Image.Resampling.NEAREST)
-            .convert("RGB")
-        )
-        _write(
-            ImageDraw.Draw(panels[-1]),
-            shape,
-            (0, 0, size[0] - 1, size[1] - 1),
-            size,
-            font,
-            [],
-        )
+    _draw_boxes(image, shapes, factor, font)
+    panels = [image, *_make_map_panels(shapes, size, font)]
     sheet: Floats = np.hstack(
         [np.asarray(panel, dtype=np.float32) for panel in panels]
     ) / np.float32(255.0)
     return sheet
 
 
+def _draw_mask(image: Image.Image, shape: Shape) -> None:
+    """Tint the pixels of a mask of the model, or draw the outline of a true one."""
+    small_mask = Image.fromarray(np.asarray(shape.mask, dtype=bool))
+    mask = np.asarray(small_mask.resize(image.size, Image.Resampling.NEAREST))
+    strength = mask * TINT
+    if shape.true:
+        strength = _find_outline(mask).astype(float)
+    colour = Image.new("RGB", image.size, TRUE if shape.true else SAID)
+    opacity = Image.fromarray(np.rint(255.0 * strength).astype(np.uint8))
+    image.paste(colour, (0, 0), opacity)
+
+
+def _find_outline(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Return the pixels of a mask within two pixels of its border along an axis."""
+    padded = np.pad(mask, 2)
+    inner = (
+        mask
+        & padded[4:, 2:-2]
+        & padded[:-4, 2:-2]
+        & padded[2:-2, 4:]
+        & padded[2:-2, :-4]
+    )
+    outline: npt.NDArray[np.bool_] = mask & ~inner
+    return outline
+
+
+def _draw_boxes(
+    image: Image.Image, shapes: Sequence[Shape], factor: int, font: Any
+) -> None:
+    """Draw the boxes of shapes, and then their texts, of which none covers another."""
+    draw = ImageDraw.Draw(image)
+    boxes = [
+        (shape, _corners(shape.box, factor, image.size))
+        for shape in shapes
+        if shape.box is not None
+    ]
+    for shape, corners in boxes:
+        draw.rectangle(corners, outline=TRUE if shape.true else SAID, width=2)
+    text_boxes: list[tuple[int, int, int, int]] = []
+    for shape, corners in boxes:
+        text_box = _write(draw, shape, corners, image.size, font, text_boxes)
+        text_boxes.append(text_box)
+
+
+def _make_map_panels(
+    shapes: Sequence[Shape], size: tuple[int, int], font: Any
+) -> list[Image.Image]:
+    """Return the maps of shapes as grey images with texts, the true one first."""
+    maps = sorted(
+        (shape for shape in shapes if shape.map is not None),
+        key=lambda shape: not shape.true,
+    )
+    if not maps:
+        return []
+    lower = float(maps[0].map.min())
+    upper = float(maps[0].map.max())
+    panels = []
+    for shape in maps:
+        values = np.asarray(shape.map, dtype=np.float64)
+        greys = np.clip((values - lower) / max(upper - lower, 1e-12), 0.0, 1.0)
+        levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
+        grey_image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
+        panel = grey_image.convert("RGB")
+        frame = (0, 0, size[0] - 1, size[1] - 1)
+        _write(ImageDraw.Draw(panel), shape, frame, size, font, [])
+        panels.append(panel)
+    return panels
+
+
 def _corners(box: Box, factor: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    x0, y0, x1, y1 = (round(end * factor) for end in box)
-    left, top = (
-        min(max(start, 0), side - 1) for start, side in zip((x0, y0), size, strict=True)
-    )
-    right, bottom = (
-        min(end, side) - 1 for end, side in zip((x1, y1), size, strict=True)
-    )
+    """Return the first and last pixels of a box in the magnified image, inside of it."""
+    x0, y0, x1, y1 = (round(bound * factor) for bound in box)
+    width, height = size
+    left = min(max(x0, 0), width - 1)
+    top = min(max(y0, 0), height - 1)
+    right = min(x1, width) - 1
+    bottom = min(y1, height) - 1
     return left, top, max(left, right), max(top, bottom)
 
 
 def _write(
-    draw: ImageDraw.ImageDraw, shape: Shape, ends: tuple[int, int, int, int], size: tuple[int, int], font: Any,
-    others: Sequence[tuple[int, int, int, int]],
-) -> tuple[int, int, int, int]:  # fmt: skip
-    """Write beside a box, and return where: above it, or below where it is true, where
-    no other text is.
+    draw: ImageDraw.ImageDraw,
+    shape: Shape,
+    corners: tuple[int, int, int, int],
+    size: tuple[int, int],
+    font: Any,
+    text_boxes: Sequence[tuple[int, int, int, int]],
+) -> tuple[int, int, int, int]:
+    """Write the text of a shape at its box, and return the text's box.
+
+    It stands above the box, or below that of what is true, moved up or down to where no
+    other text is.
     """
     text = f"true: {shape.text}" if shape.true else shape.text
     left, top, right, bottom = map(round, draw.textbbox((0, 0), text, font=font))
-    wide = right - left + 6
-    high = bottom - top + 6
-    y = ends[3] if shape.true else ends[1] - high
-    x = max(0, min(ends[0], size[0] - wide))
-    y = max(0, min(y, size[1] - high))
+    width = right - left + 6
+    height = bottom - top + 6
+    x = max(0, min(corners[0], size[0] - width))
+    preferred_y = corners[3] if shape.true else corners[1] - height
+    preferred_y = max(0, min(preferred_y, size[1] - height))
 
-    def free(row: int) -> bool:
+    def is_free(y: int) -> bool:
         return all(
-            x > x1 or x0 > x + wide or row > y1 or y0 > row + high
-            for x0, y0, x1, y1 in others
+            x > x1 or x0 > x + width or y > y1 or y0 > y + height
+            for x0, y0, x1, y1 in text_boxes
         )
 
-    rows = sorted(
-        range(max(size[1] - high, 0) + 1), key=lambda row: (abs(row - y), row)
+    nearest_first = sorted(
+        range(max(size[1] - height, 0) + 1), key=lambda y: (abs(y - preferred_y), y)
     )
-    y = next(filter(free, rows), y)
-    draw.rectangle((x, y, x + wide, y + high), fill=TRUE if shape.true else SAID)
+    y = next(filter(is_free, nearest_first), preferred_y)
+    draw.rectangle((x, y, x + width, y + height), fill=TRUE if shape.true else SAID)
     draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)
-    return x, y, x + wide, y + high
+    return x, y, x + width, y + height
 
 
 GAP = 8  # Pixels between tiles, and of a line of text
@@ -354,43 +410,68 @@ NARROWEST = 160
 def contact_sheet(
     pictures: Sequence[Floats], captions: Sequence[Sequence[str]]
 ) -> Floats:
-    """Return pictures (H, W, 3), display-referred sRGB in [0, 1] and all of one size,
-    side by side on white, each over lines of text; what is too long for the tile is
-    cut. As the pictures, float32.
+    """Return pictures side by side on white, each over lines of text, as float32.
+
+    Args:
+        pictures: (H, W, 3), display-referred sRGB in [0, 1], all of one size; small
+            ones are magnified.
+        captions: lines of each picture; what is too long for the tile is cut.
     """
-    columns = columns_for(len(pictures))
-    rows = math.ceil(len(pictures) / columns)
     factor = math.ceil(NARROWEST / pictures[0].shape[1])
     height, width = (factor * side for side in pictures[0].shape[:2])
     cell = width + GAP, height + LINE * max(map(len, captions)) + GAP
-    sheet = Image.new("RGB", (GAP + columns * cell[0], GAP + rows * cell[1]), "white")
+    n_columns = columns_for(len(pictures))
+    n_rows = math.ceil(len(pictures) / n_columns)
+    sheet_size = GAP + n_columns * cell[0], GAP + n_rows * cell[1]
+    sheet = Image.new("RGB", sheet_size, "white")
+    for index, picture in enumerate(pictures):
+        row, column = divmod(index, n_columns)
+        corner = GAP + column * cell[0], GAP + row * cell[1]
+        _paste_tile(sheet, picture, captions[index], corner, (width, height))
+    return np.asarray(np.asarray(sheet, dtype=np.float32) / np.float32(255.0))
+
+
+def _paste_tile(
+    sheet: Image.Image,
+    picture: Floats,
+    lines: Sequence[str],
+    corner: tuple[int, int],
+    size: tuple[int, int],
+) -> None:
+    """Put a picture of a size (width, height) on a sheet, and its caption below it."""
+    left, top = corner
+    width, height = size
+    tile = Image.fromarray(to_8bit(picture)).resize(size, Image.Resampling.NEAREST)
+    sheet.paste(tile, corner)
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(FONT)
-    for number, (picture, lines) in enumerate(zip(pictures, captions, strict=True)):
-        left = GAP + number % columns * cell[0]
-        top = GAP + number // columns * cell[1]
-        tile = Image.fromarray(to_8bit(picture)).resize(
-            (width, height), Image.Resampling.NEAREST
-        )
-        sheet.paste(tile, (left, top))
-        for place, line in enumerate(lines):
-            text = short = " ".join(line[:200].split())
-            while short and draw.textlength(text, font=font) > width:
-                short = short[:-1]
-                text = f"{short}..."
-            draw.text(
-                (left, top + height + LINE * place), text, fill="black", font=font
-            )
-    levels: Floats = np.asarray(sheet, dtype=np.float32)
-    return np.asarray(levels / np.float32(255.0))
+    _write_caption(draw, lines, (left, top + height), width, font)
+
+
+def _write_caption(
+    draw: ImageDraw.ImageDraw,
+    lines: Sequence[str],
+    corner: tuple[int, int],
+    width: int,
+    font: Any,
+) -> None:
+    """Write lines of text below each other, each cut to a width in pixels."""
+    left, top = corner
+    for index, line in enumerate(lines):
+        text = " ".join(line[:200].split())
+        start = text
+        while start and draw.textlength(text, font=font) > width:
+            start = start[:-1]
+            text = f"{start}..."
+        draw.text((left, top + LINE * index), text, fill="black", font=font)
 
 
 def columns_for(count: int) -> int:
-    """Return how many of `count` tiles stand side by side: about the square root, and
-    no holes where that can be.
+    """Return in how many columns `count` tiles stand: about the square root, and a
+    divisor of the count if one is near.
     """
-    least = math.ceil(math.sqrt(count))
-    return next(
-        (columns for columns in range(least, 2 * least + 1) if count % columns == 0),
-        least,
-    )
+    min_columns = math.ceil(math.sqrt(count))
+    for n_columns in range(min_columns, 2 * min_columns + 1):
+        if count % n_columns == 0:
+            return n_columns
+    return min_columns

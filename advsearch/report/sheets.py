@@ -109,9 +109,15 @@ class Placed:
 
 
 def write_sheets(
-    path: Path, pieces: Sequence[Piece], title: str, *, paper: str = "a4", profile: Path | None = None,
-    most: int = MOST_SHEETS, last: Callable[[str, tuple[float, float], Any], Figure] | None = None,
-) -> int:  # fmt: skip
+    path: Path,
+    pieces: Sequence[Piece],
+    title: str,
+    *,
+    paper: str = "a4",
+    profile: Path | None = None,
+    most: int = MOST_SHEETS,
+    last: Callable[[str, tuple[float, float], Any], Figure] | None = None,
+) -> int:
     """Write the PDF of at least one piece, and return how many pages it has.
 
     Colours are converted into an ICC `profile` of an RGB printer; None leaves them
@@ -203,42 +209,43 @@ def pages_of(
 
 
 def _parts(piece: Piece, width: float, height: float) -> Iterator[Placed]:
-    """Cut a piece into equal parts that fit on a page with bleed and marks, in whole
-    pixels.
+    """Cut a piece into equal parts that fit on a page with bleed and marks.
+
+    The cuts lie between pixels. Width and height of the page are in millimetres.
     """
-    (left, top) = piece.bleed
-    cuts = []
-    lengths = piece.picture.shape[1] - 2 * left, piece.picture.shape[0] - 2 * top
-    for length, side, frame, pixel in zip(
-        lengths, (width, height), piece.frame, piece.pixel, strict=True
-    ):
-        most = (side - 2 * frame) / pixel
-        if most < 1.0:
-            raise InputError(
-                "size: a pixel of it is larger than a sheet; give a "
-                "smaller one, or a larger `paper`"
-            )
-        count = math.ceil(length / math.floor(most))
-        cuts.append(
-            list(
-                itertools.pairwise(
-                    round(length * number / count) for number in range(count + 1)
-                )
-            )
-        )
-    columns, rows = cuts
-    if len(columns) * len(rows) > SHEETS_EVER:
+    left, top = piece.bleed
+    n_rows, n_columns = piece.picture.shape[:2]
+    columns = _cut_evenly(
+        n_columns - 2 * left, (width - 2 * piece.frame[0]) / piece.pixel[0]
+    )
+    rows = _cut_evenly(n_rows - 2 * top, (height - 2 * piece.frame[1]) / piece.pixel[1])
+    n_parts = len(columns) * len(rows)
+    if n_parts > SHEETS_EVER:
         raise InputError(
             f"size: it would take more than {SHEETS_EVER} sheets; give a smaller one"
         )
-    for i, (y0, y1) in enumerate(rows):
-        for j, (x0, x1) in enumerate(columns):
-            name = (
-                f"{piece.name}, row {i + 1} of {len(rows)}, column {j + 1} of "
-                f"{len(columns)}"
-            )
-            name = name if len(columns) * len(rows) > 1 else piece.name
+    for row, (y0, y1) in enumerate(rows, 1):
+        for column, (x0, x1) in enumerate(columns, 1):
+            name = piece.name
+            if n_parts > 1:
+                name += f", row {row} of {len(rows)}, column {column} of {len(columns)}"
             yield Placed(piece, name, (left + x0, left + x1, top + y0, top + y1))
+
+
+def _cut_evenly(length: int, max_length: float) -> list[tuple[int, int]]:
+    """Return bounds of the fewest equal parts of a length, in pixels, that fit.
+
+    Raises:
+        InputError: not even one pixel fits.
+    """
+    if max_length < 1.0:
+        raise InputError(
+            "size: a pixel of it is larger than a sheet; give a "
+            "smaller one, or a larger `paper`"
+        )
+    count = math.ceil(length / math.floor(max_length))
+    bounds = [round(length * index / count) for index in range(count + 1)]
+    return list(itertools.pairwise(bounds))
 
 
 def blank(paper: tuple[float, float]) -> tuple[Figure, Axes]:
@@ -302,34 +309,51 @@ def _ruler(axes: Axes, paper: tuple[float, float]) -> None:
 
 
 def _draw(axes: Axes, part: Placed, convert: Any) -> None:
+    """Draw a part on its page: image with bleed, marks, line to cut along and name."""
     piece = part.piece
-    (x0, x1, y0, y1) = part.trim
-    (left, top) = piece.bleed
-    (wide, high) = piece.pixel
-    picture = piece.picture[y0 - top : y1 + top, x0 - left : x1 + left]
+    x0, x1, y0, y1 = part.trim
+    bleed_x, bleed_y = piece.bleed
+    pixel_width, pixel_height = piece.pixel
+    picture = piece.picture[y0 - bleed_y : y1 + bleed_y, x0 - bleed_x : x1 + bleed_x]
     if convert is not None:
         picture = np.asarray(ImageCms.applyTransform(Image.fromarray(picture), convert))
-    right = part.x + (x1 - x0) * wide
-    bottom = part.y + (y1 - y0) * high
-    outer = (
-        part.x - left * wide,
-        right + left * wide,
-        part.y - top * high,
-        bottom + top * high,
-    )
+    trim_x = part.x, part.x + (x1 - x0) * pixel_width
+    trim_y = part.y, part.y + (y1 - y0) * pixel_height
+    outer_x = trim_x[0] - bleed_x * pixel_width, trim_x[1] + bleed_x * pixel_width
+    outer_y = trim_y[0] - bleed_y * pixel_height, trim_y[1] + bleed_y * pixel_height
     axes.imshow(
         picture,
-        extent=(outer[0], outer[1], outer[3], outer[2]),
+        extent=(outer_x[0], outer_x[1], outer_y[1], outer_y[0]),
         interpolation="none",
         aspect="auto",
     )
-    for x, edge_x, away in ((part.x, outer[0], -1.0), (right, outer[1], 1.0)):
-        for y, edge_y, up in ((part.y, outer[2], -1.0), (bottom, outer[3], 1.0)):
-            _line(axes, [edge_x + away * AWAY, edge_x + away * (AWAY + MARK)], [y, y])
-            _line(axes, [x, x], [edge_y + up * AWAY, edge_y + up * (AWAY + MARK)])
+    _draw_cut_marks(axes, trim_x, trim_y, outer_x, outer_y)
     if piece.inside is not None:
-        inside = np.pad(piece.inside[y0:y1, x0:x1].astype(float), 1)
-        xs = part.x + (np.arange(-1, x1 - x0 + 1) + 0.5) * wide
-        ys = part.y + (np.arange(-1, y1 - y0 + 1) + 0.5) * high
-        axes.contour(xs, ys, inside, levels=[0.5], colors="black", linewidths=0.3)
-    axes.text(part.x, outer[2] - AWAY, part.name, fontsize=6, va="bottom")
+        _draw_cut_line(axes, part, piece.inside[y0:y1, x0:x1])
+    axes.text(part.x, outer_y[0] - AWAY, part.name, fontsize=6, va="bottom")
+
+
+def _draw_cut_marks(
+    axes: Axes,
+    trim_x: tuple[float, float],
+    trim_y: tuple[float, float],
+    outer_x: tuple[float, float],
+    outer_y: tuple[float, float],
+) -> None:
+    """Draw two marks at each corner, outside of the bleed, in line with the trim."""
+    for x, edge_x, sign_x in zip(trim_x, outer_x, (-1.0, 1.0), strict=True):
+        for y, edge_y, sign_y in zip(trim_y, outer_y, (-1.0, 1.0), strict=True):
+            mark_x = [edge_x + sign_x * AWAY, edge_x + sign_x * (AWAY + MARK)]
+            mark_y = [edge_y + sign_y * AWAY, edge_y + sign_y * (AWAY + MARK)]
+            _line(axes, mark_x, [y, y])
+            _line(axes, [x, x], mark_y)
+
+
+def _draw_cut_line(axes: Axes, part: Placed, inside: Mask) -> None:
+    """Draw the outline of what is cut out of a part, (rows, columns)."""
+    n_rows, n_columns = inside.shape
+    pixel_width, pixel_height = part.piece.pixel
+    padded = np.pad(inside.astype(float), 1)
+    xs = part.x + (np.arange(-1, n_columns + 1) + 0.5) * pixel_width
+    ys = part.y + (np.arange(-1, n_rows + 1) + 0.5) * pixel_height
+    axes.contour(xs, ys, padded, levels=[0.5], colors="black", linewidths=0.3)

@@ -148,14 +148,14 @@ class ResultPart:
         """Return a table, a row for each of some values, with columns by their heads,
         and `more` of its attributes.
         """
-        made = [
+        cells = [
             [
-                made(row) if callable(made) else made.format(row)
-                for made in columns.values()
+                cells(row) if callable(cells) else cells.format(row)
+                for cells in columns.values()
             ]
             for row in rows
         ]
-        return cls(heads=tuple(columns), rows=made, **more)
+        return cls(heads=tuple(columns), rows=cells, **more)
 
     @property
     def empty(self) -> bool:
@@ -189,106 +189,118 @@ def shown(result: Result) -> ShownResult:
     return view
 
 
-def remarks_of(result: Result, given: ShownResult) -> list[str]:
+def remarks_of(result: Result, view: ShownResult) -> list[str]:
+    """Return what to know of a result before it is used: its state, cautions, warnings."""
     ending = getattr(result, "ending", "")
-    unsaid = ending == INTERRUPTED and not given.says_interrupted
-    stopped = ["Not finished: these are the results so far."] if unsaid else []
-    stopped += (
-        ["It is running: this is what has come out so far."]
-        if ending == RUNNING
-        else []
-    )
-    return [*stopped, *given.cautions, *getattr(result, "warnings", ())]
+    remarks = []
+    if ending == INTERRUPTED and not view.says_interrupted:
+        remarks.append("Not finished: these are the results so far.")
+    if ending == RUNNING:
+        remarks.append("It is running: this is what has come out so far.")
+    return [*remarks, *view.cautions, *getattr(result, "warnings", ())]
 
 
-def subject_of(result: Result, given: ShownResult) -> list[str]:
-    named = [
-        getattr(result, name, None) or ()
-        for name in ("object", "objects", "controls", "model")
-    ]
-    return [*given.about] or [
-        ", ".join([names] if isinstance(names, str) else names)
-        for names in named
-        if names
-    ]
+def subject_of(result: Result, view: ShownResult) -> list[str]:
+    """Return what a result is about: its own names, or object, controls and model."""
+    if view.about:
+        return [*view.about]
+    subjects = []
+    for name in ("object", "objects", "controls", "model"):
+        names = getattr(result, name, None)
+        if names:
+            subjects.append(names if isinstance(names, str) else ", ".join(names))
+    return subjects
 
 
-def facts_of(result: Result, given: ShownResult) -> dict[str, str]:
+def facts_of(result: Result, view: ShownResult) -> dict[str, str]:
+    """Return what a result was made with, by name, the facts of its view first."""
     renders = getattr(result, "renders", None)
     seconds = getattr(result, "seconds", None)
-    spent = sum(renders.values()) if isinstance(renders, Mapping) else renders
-    own = {
-        "environment": ""
-        if "environments" in given.facts
-        else getattr(result, "environment", ""),
-        "renders": "" if spent is None else str(spent),
+    n_renders = sum(renders.values()) if isinstance(renders, Mapping) else renders
+    environment = getattr(result, "environment", "")
+    if "environments" in view.facts:
+        environment = ""
+    common_facts = {
+        "environment": environment,
+        "renders": "" if n_renders is None else str(n_renders),
         "workers": wording.workers_text(getattr(result, "shared", None)),
         "time": wording.seconds_text(seconds["total"]) if seconds else "",
         "seed": str(getattr(result, "seed", "")),
         **result.facts(),
     }
-    return {
-        name: text
-        for name, text in {**given.facts, **own, **given.facts}.items()
-        if text
-    }
+    # the view's facts stand first, and their texts count
+    facts = {**view.facts, **common_facts, **view.facts}
+    return {name: text for name, text in facts.items() if text}
 
 
 def fields_shown(result: Result) -> ShownResult:
-    """Return the lists of a result as tables, its other fields as facts, and what their
-    names mean.
+    """Return the view of a result that has none of its own.
+
+    Its lists are tables, its other fields facts, and a last table says what their names
+    mean.
     """
     values = {name: getattr(result, name) for name in type(result).described()}
-    lists = {
-        name: value
-        for name, value in values.items()
-        if isinstance(value, (list, tuple)) and value
-    }
-    tables = {
-        name: rows
-        for name, rows in lists.items()
-        if all(isinstance(row, Fields) for row in rows)
-    }
-    elsewhere = (
-        *_ELSEWHERE,
-        *tables,
-        *(name.replace(" ", "_") for name in result.facts()),
-    )
-    plain = {
+    tables = {name: value for name, value in values.items() if _is_table(value)}
+    facts = _find_plain_facts(result, values, tables)
+    described: list[tuple[Fields, set[str]]] = [
+        (result, {name for name, text in facts.items() if text})
+    ]
+    sections = []
+    for name, rows in tables.items():
+        table = _make_table(name, rows)
+        sections.append(table)
+        described.append((rows[0], set(table.heads)))
+    sections.append(_explain_words(described))
+    brief = result.brief or str(values.get("ending", "done"))
+    return ShownResult(brief[:1].upper() + brief[1:] + ".", sections, facts)
+
+
+def _is_table(value: object) -> bool:
+    """Return whether a value is a list of results' rows that has any."""
+    if not isinstance(value, (list, tuple)) or not value:
+        return False
+    return all(isinstance(row, Fields) for row in value)
+
+
+def _find_plain_facts(
+    result: Result, values: Mapping[str, Any], tables: Iterable[str]
+) -> dict[str, str]:
+    """Return the fields of a result that no table and no heading has, as texts."""
+    fact_names = [name.replace(" ", "_") for name in result.facts()]
+    elsewhere = {*_ELSEWHERE, *tables, *fact_names}
+    return {
         _words(name): _text(value)
         for name, value in values.items()
         if name not in elsewhere
     }
-    described: list[tuple[Fields, set[str]]] = [
-        (result, {name for name, text in plain.items() if text})
+
+
+def _make_table(name: str, rows: Sequence[Fields]) -> ResultPart:
+    """Return rows as a table, without the columns that are empty in all of them."""
+    names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
+    columns = [
+        column
+        for column in names
+        if any(_text(getattr(row, column, None)) for row in rows)
     ]
-    sections = []
+    cells = [[_text(getattr(row, column, None)) for column in columns] for row in rows]
+    heads = list(map(_words, columns))
+    return ResultPart(_words(name), heads=heads, rows=cells, folded=len(rows) > LONG)
+
+
+def _explain_words(described: Iterable[tuple[Fields, set[str]]]) -> ResultPart:
+    """Return a table of what words mean, by the descriptions of the fields they name.
+
+    Args:
+        described: objects with fields, and the words that are used of each.
+    """
     meanings = dict[str, str]()
-    for name, rows in tables.items():
-        names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
-        columns = [
-            column
-            for column in names
-            if any(_text(getattr(row, column, None)) for row in rows)
-        ]
-        cells = [
-            [_text(getattr(row, column, None)) for column in columns] for row in rows
-        ]
-        heads = list(map(_words, columns))
-        sections.append(
-            ResultPart(_words(name), heads=heads, rows=cells, folded=len(rows) > LONG)
-        )
-        described.append((rows[0], set(heads)))
     for fields, words in described:
         for name, about in type(fields).described().items():
             if about.description and _words(name) in words:
                 meanings.setdefault(_words(name), about.description.replace("`", ""))
-    meaning = [[*pair] for pair in meanings.items()]
-    sections.append(
-        ResultPart("What these words mean", rows=meaning, folded=True, only="page")
-    )
-    brief = result.brief or str(values.get("ending", "done"))
-    return ShownResult(brief[:1].upper() + brief[1:] + ".", sections, plain)
+    rows = [[word, meaning] for word, meaning in meanings.items()]
+    return ResultPart("What these words mean", rows=rows, folded=True, only="page")
 
 
 def _text(value: object) -> str:
@@ -406,16 +418,16 @@ def average_claim(case: AverageCase, name: str) -> Claim:
 
 
 def searches_text(renders: Mapping[str, int], policy: str, random: bool) -> str:
-    """``24 renders by the policy auto and 24 by random search``; what was predicted
-    instead is said too.
+    """Return how much was searched: ``24 renders by the policy auto and 24 by random
+    search``, and how many images were predicted instead.
     """
-    own = renders.get("search", 0) + renders.get("gradient", 0)
-    text = f"{wording.count(own, 'render')} by the policy {policy}"
+    n_renders = renders.get("search", 0) + renders.get("gradient", 0)
+    text = f"{wording.count(n_renders, 'render')} by the policy {policy}"
     if renders.get("products"):
         text += f", {renders['products']} more predicted,"
-    return (
-        f"{text} and {renders.get('baseline', 0)} by random search" if random else text
-    )
+    if random:
+        text += f" and {renders.get('baseline', 0)} by random search"
+    return text
 
 
 def extent_of(what: str, rate: VerifiedRate | None) -> Extent | None:
@@ -446,7 +458,7 @@ def claim(kind: Kind, text: str, extent: Extent | None) -> Claim:
     return Claim(kind=kind, statement=text, extent=extent)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # HTML that is escaped by construction: text becomes markup only through `element`.
 #
 # And results as a notebook shows them (what is said, pictures or a figure, and tables,
@@ -467,13 +479,13 @@ def element(tag: str, *children: str | None, **attributes: str | float) -> Html:
     Of attributes ``class_`` is ``class``, and other underscores become hyphens.
     """
     names = {"class_": "class", "viewBox": "viewBox"}
-    given = "".join(
+    attribute_text = "".join(
         f' {names.get(name, name.replace("_", "-"))}="{escape(str(value), quote=True)}"'
         for name, value in attributes.items()
     )
     if tag in _VOID:
-        return Html(f"<{tag}{given}>")
-    return Html(f"<{tag}{given}>{join_html(*children)}</{tag}>")
+        return Html(f"<{tag}{attribute_text}>")
+    return Html(f"<{tag}{attribute_text}>{join_html(*children)}</{tag}>")
 
 
 def join_html(*parts: str | None) -> Html:
@@ -538,57 +550,59 @@ class InNotebook:
 
 
 def result_html(
-    given: ShownResult, pictures: Mapping[str, ArrayLike] | None = None
+    view: ShownResult, pictures: Mapping[str, ArrayLike] | None = None
 ) -> str:
+    """Return a result as HTML for a notebook: its sentence, pictures, figure, tables."""
     figures = []
     for name, image in (pictures or {}).items():
         picture = _picture(png_bytes(image), SHOWN, name)
+        caption = element("figcaption", name)
         figures.append(
-            element(
-                "figure",
-                picture,
-                element("figcaption", name),
-                style="display:inline-block",
-            )
+            element("figure", picture, caption, style="display:inline-block")
         )
-    figure = result_figure(given)
-    chart = (
-        _picture(figure["png"], 2 * SHOWN, "the numbers of the table")
-        if figure
-        else None
-    )
-    parts = []
-    for part in given.sections:
-        if part.only in ("", "notebook") and not part.empty:
-            inside = [
-                element("p", text) for text in part.text if text and part.draw is None
-            ]
-            if part.rows:
-                heads = element("tr", *(element("th", cell) for cell in part.heads))
-                rows = (
-                    element("tr", *(element("td", cell) for cell in row))
-                    for row in part.rows
-                )
-                head = element("thead", heads) if part.heads else None
-                inside.append(element("table", head, element("tbody", *rows)))
-            title = element("p", element("b", part.title)) if part.title else None
-            folded = element("details", element("summary", part.title), *inside)
-            parts.append(folded if part.folded else element("div", title, *inside))
-    return element("div", element("p", given.said), *figures, chart, *parts)
+    figure = result_figure(view)
+    chart = None
+    if figure:
+        chart = _picture(figure["png"], 2 * SHOWN, "the numbers of the table")
+    sections = [
+        _make_section_html(part)
+        for part in view.sections
+        if part.only in ("", "notebook") and not part.empty
+    ]
+    return element("div", element("p", view.said), *figures, chart, *sections)
 
 
-def result_figure(given: ShownResult) -> Figures:
-    for part in given.sections:
+def _make_section_html(part: ResultPart) -> Html:
+    """Return the texts and the table of a part of a result as HTML."""
+    children = [element("p", text) for text in part.text if text and part.draw is None]
+    if part.rows:
+        heads = element("tr", *(element("th", cell) for cell in part.heads))
+        head = element("thead", heads) if part.heads else None
+        rows = [
+            element("tr", *(element("td", cell) for cell in row)) for row in part.rows
+        ]
+        children.append(element("table", head, element("tbody", *rows)))
+    if part.folded:
+        return element("details", element("summary", part.title), *children)
+    title = element("p", element("b", part.title)) if part.title else None
+    return element("div", title, *children)
+
+
+def result_figure(view: ShownResult) -> Figures:
+    """Return the files of the first chart of a result; none if it has no chart."""
+    for part in view.sections:
         if part.draw is not None:
             return figure_of(part.draw, part.size or (WIDTH, part.height / PIXELS))
     return {}
 
 
 def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
-    arrays = [np.asarray(picture, dtype=np.float32) for picture in pictures]
-    gap = np.ones((len(arrays[0]), GAP, 3), np.float32)
+    images = [np.asarray(picture, dtype=np.float32) for picture in pictures]
+    gap = np.ones((len(images[0]), GAP, 3), np.float32)
     return png_bytes(
-        np.concatenate([part for array in arrays for part in (array, gap)][:-1], axis=1)
+        np.concatenate(
+            [block for array in images for block in (array, gap)][:-1], axis=1
+        )
     )
 
 
@@ -618,14 +632,27 @@ COLORS = {
 # The same of the colours that figures have
 OF_FIGURES = {"search": BLUE, "baseline": RED, "soft": GREY}
 STYLE: dict[Any, Any] = {
-    "font.size": 13.0, "path.simplify": False,
-    "legend.fontsize": 13.0, "legend.labelcolor": "linecolor", "legend.borderpad": 0.0, "legend.handlelength": 1.6,
-    "axes.spines.left": False, "axes.grid.axis": "y", "axes.grid": True,
-    **dict.fromkeys(("axes.edgecolor", "grid.color", "xtick.color", "ytick.color"), COLORS["line"]),
-    **dict.fromkeys(("axes.labelcolor", "text.color", "xtick.labelcolor", "ytick.labelcolor"), COLORS["soft"]),
+    "font.size": 13.0,
+    "path.simplify": False,
+    "legend.fontsize": 13.0,
+    "legend.labelcolor": "linecolor",
+    "legend.borderpad": 0.0,
+    "legend.handlelength": 1.6,
+    "axes.spines.left": False,
+    "axes.grid.axis": "y",
+    "axes.grid": True,
+    **dict.fromkeys(
+        ("axes.edgecolor", "grid.color", "xtick.color", "ytick.color"), COLORS["line"]
+    ),
+    **dict.fromkeys(
+        ("axes.labelcolor", "text.color", "xtick.labelcolor", "ytick.labelcolor"),
+        COLORS["soft"],
+    ),
     **dict.fromkeys(("xtick.major.size", "ytick.major.size"), 0.0),
-    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"),
-}  # fmt: skip
+    **dict.fromkeys(
+        ("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"
+    ),
+}
 
 
 def study_chart(
@@ -649,28 +676,33 @@ def study_chart(
 
     (file,) = drawn(on_figure, (width / 72, height / 72), ("svg",), STYLE).values()
     return element(
-        "svg", element("title", words), _inline(file.decode("utf-8"), f"{width}-"), viewBox=f"0 0 {width} {height}",
-        class_="chart wide" if width == WIDE else "chart narrow", role="img", aria_label=words,
-    )  # fmt: skip
+        "svg",
+        element("title", words),
+        _inline(file.decode("utf-8"), f"{width}-"),
+        viewBox=f"0 0 {width} {height}",
+        class_="chart wide" if width == WIDE else "chart narrow",
+        role="img",
+        aria_label=words,
+    )
 
 
-def _inline(file: str, prefix: str) -> Html:
+def _inline(svg: str, prefix: str) -> Html:
     """Return what a file in SVG draws: without its head, hundredths of a pixel, names
     and frames to cut at.
 
     All that is drawn lies in the frame. Names that are pointed at, those of markers,
     stay, behind the prefix: a page of two charts would have them twice.
     """
-    shapes = file[file.index("<g ") : file.rindex("</svg>")]
-    needless = (
+    shapes = svg[svg.index("<g ") : svg.rindex("</svg>")]
+    unneeded = (
         r"<clipPath.*?</clipPath>|<!--.*?-->| "
         r'clip-path="[^"]*"|(?<=\d\.\d)\d+(?=[^<>]*>)'
     )
-    shapes = re.sub(needless, "", shapes, flags=re.DOTALL)
-    pointed = set(re.findall(r'href="#([^"]+)"', shapes))
+    shapes = re.sub(unneeded, "", shapes, flags=re.DOTALL)
+    referenced_ids = set(re.findall(r'href="#([^"]+)"', shapes))
     shapes = re.sub(
         r' id="([^"]*)"',
-        lambda one: f' id="{prefix}{one[1]}"' if one[1] in pointed else "",
+        lambda match: f' id="{prefix}{match[1]}"' if match[1] in referenced_ids else "",
         shapes,
     )
     shapes = re.sub(r'href="#', f'href="#{prefix}', shapes)

@@ -112,18 +112,18 @@ def percent_number(share: float, most: int = MOST_DECIMALS) -> str:
     most, as show how far it is away.
     """
     value = 100.0 * share
-    away = min(value, 100.0 - value)
-    if away >= 5.0 or away <= 0.0:
+    distance = min(value, 100.0 - value)
+    if distance >= 5.0 or distance <= 0.0:
         return f"{value:.0f}"
-    decimals = min(max(1, -math.floor(math.log10(away))), most)
+    decimals = min(max(1, -math.floor(math.log10(distance))), most)
     text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
     if text not in ("0", "100"):
         return text
-    least = 10.0**-decimals
+    smallest = 10.0**-decimals
     return (
-        f"under {least:.{decimals}f}"
+        f"under {smallest:.{decimals}f}"
         if text == "0"
-        else f"over {100.0 - least:.{decimals}f}"
+        else f"over {100.0 - smallest:.{decimals}f}"
     )
 
 
@@ -167,32 +167,32 @@ def with_article(name: str) -> str:
 
 
 def beside_text(run: str, pair: Any) -> str:
-    """Return what a model does without and with the adversarial scene of a run
+    """Return how often a model is right without and with the adversarial scene of a run
     (`PairedRates`), in sentences.
     """
-    sides = [
-        f"{side.correct} of {side.configurations} ({percent(side.accuracy)}, 95 % "
+    clean, adversarial = (
+        f"{arm.correct} of {arm.configurations} ({percent(arm.accuracy)}, 95 % "
         "interval "
-        f"{interval_text(side.interval)})"
-        for side in (pair.clean, pair.answer)
-    ]
-    low, high = (100.0 * end for end in pair.interval)
-    ends = (
-        f"{-high:.0f} to {-low:.0f}"
-        if pair.difference < 0
-        else f"{low:.0f} to {high:.0f}"
+        f"{interval_text(arm.interval)})"
+        for arm in (pair.clean, pair.answer)
     )
-    shown = (
-        "" if low > 0.0 or high < 0.0 else ("; that there is a difference is not shown")
-    )
+    lower, upper = (100.0 * bound for bound in pair.interval)
+    if pair.difference < 0:
+        interval = f"{-upper:.0f} to {-lower:.0f}"
+        direction = "fewer"
+    else:
+        interval = f"{lower:.0f} to {upper:.0f}"
+        direction = "more"
+    doubt = ""
+    if not (lower > 0.0 or upper < 0.0):
+        doubt = "; that there is a difference is not shown"
     return (
-        f"{pair.model} is right in {sides[0]} of the clean scene, and in {sides[1]} "
-        "with the adversarial scene of "
-        f"{run}: {abs(100.0 * pair.difference):.0f} points "
-        f"{'fewer' if pair.difference < 0 else 'more'} (95 % "
-        f"interval of pairs {ends}){shown}. Right in the clean one alone are "
-        f"{pair.clean_only} pairs, with the "
-        f"adversarial one alone {pair.answer_only}."
+        f"{pair.model} is right in {clean} of the clean scene, and in {adversarial} "
+        f"with the adversarial scene of {run}: "
+        f"{abs(100.0 * pair.difference):.0f} points {direction} "
+        f"(95 % interval of pairs {interval}){doubt}. "
+        f"Right in the clean one alone are {pair.clean_only} pairs, "
+        f"with the adversarial one alone {pair.answer_only}."
     )
 
 
@@ -232,43 +232,50 @@ def wanted(objective: str, thing: str) -> str:
 
 
 def prediction_cells(task: str, prediction: Said) -> list[str]:
-    """Return a prediction and its number, for a table: ``["vase", "84 %"]``, ``["no cup found", "best score of cup
-    0.12"]``.
+    """Return a prediction and its number, for a table.
+
+    For instance ``["vase", "84 %"]`` and ``["no cup found", "best score of cup 0.12"]``.
     """
     label = prediction.label
-    share = prediction.probability
+    probability = prediction.probability
+    payload = getattr(prediction, "payload", None)
     if task == COMMAND:
-        return [label, (getattr(prediction, "payload", None) or {}).get("text", "")]
-    if share is None:
+        return [label, (payload or {}).get("text", "")]
+    if probability is None:
         return [label, ""]
     if task == SIMILARITY:
-        kept = getattr(prediction, "payload", None)
-        similar = percent(share, PROBABILITY_DECIMALS)
-        if isinstance(kept, dict) and "cosine" in kept:
-            if "rank" not in kept:
-                similar = f"cosine {kept['cosine']:.2f}"
-            elif kept["rank"] > 1:
-                similar += f", right one at rank {kept['rank']} of {kept['references']}"
-        return [label, similar]
+        return [label, _similarity_text(probability, payload)]
     if task == DETECTION:
-        payload = getattr(prediction, "payload", None)
-        outcome = get_outcome(payload)
-        stated = payload if isinstance(payload, dict) else {}
-        if outcome is Outcome.MISSED:
-            return [
-                f"{label} found",
-                f"best score of {stated.get('class', 'it')} {share:.2f}",
-            ]
-        overlap = stated.get("iou")
-        if outcome is Outcome.LOOSE and isinstance(overlap, float):
-            return [label, f"score {share:.2f}, overlap {overlap:.2f}"]
-        return [label, f"score {share:.2f}"]
-    return [
-        label,
-        f"accuracy {percent(share)}"
-        if task == SEGMENTATION
-        else percent(share, PROBABILITY_DECIMALS),
-    ]
+        return _detection_cells(label, probability, payload)
+    if task == SEGMENTATION:
+        return [label, f"accuracy {percent(probability)}"]
+    return [label, percent(probability, PROBABILITY_DECIMALS)]
+
+
+def _similarity_text(probability: float, payload: Any) -> str:
+    """Return how similar the best reference is, and where the right one ranks."""
+    text = percent(probability, PROBABILITY_DECIMALS)
+    if not isinstance(payload, dict) or "cosine" not in payload:
+        return text
+    if "rank" not in payload:
+        return f"cosine {payload['cosine']:.2f}"
+    if payload["rank"] > 1:
+        rank = f"{payload['rank']} of {payload['references']}"
+        return f"{text}, right one at rank {rank}"
+    return text
+
+
+def _detection_cells(label: str, score: float, payload: Any) -> list[str]:
+    """Return what a detector finds, and its score and overlap."""
+    outcome = get_outcome(payload)
+    stated = payload if isinstance(payload, dict) else {}
+    if outcome is Outcome.MISSED:
+        class_name = stated.get("class", "it")
+        return [f"{label} found", f"best score of {class_name} {score:.2f}"]
+    overlap = stated.get("iou")
+    if outcome is Outcome.LOOSE and isinstance(overlap, float):
+        return [label, f"score {score:.2f}, overlap {overlap:.2f}"]
+    return [label, f"score {score:.2f}"]
 
 
 def prediction_text(task: str, prediction: Said) -> str:
@@ -276,48 +283,39 @@ def prediction_text(task: str, prediction: Said) -> str:
     cup 0.12)``.
     """
     label, number = prediction_cells(task, prediction)
-    if task == SEGMENTATION and number:
-        accuracy = (
-            f"accuracy over the object's pixels {percent(prediction.probability)}"
-        )
-        outcome = get_outcome(getattr(prediction, "payload", None))
-        if outcome is Outcome.MISSED:
-            return f"{label} found, {accuracy}"
-        return (
-            f"{label}, {accuracy}"
-            if outcome is Outcome.LOOSE
-            else f"{accuracy}, most often {label}"
-        )
-    if task == DETECTION and number:
+    if not number:
+        return label
+    if task == DETECTION:
         return f"{label} ({number})"
-    return f"{label}, {number}" if number else label
+    if task != SEGMENTATION:
+        return f"{label}, {number}"
+    accuracy = f"accuracy over the object's pixels {percent(prediction.probability)}"
+    outcome = get_outcome(getattr(prediction, "payload", None))
+    if outcome is Outcome.MISSED:
+        return f"{label} found, {accuracy}"
+    if outcome is Outcome.LOOSE:
+        return f"{label}, {accuracy}"
+    return f"{accuracy}, most often {label}"
 
 
 SEEN = ("seen", "box", "distance")  # Heads of `things_rows`, behind the name
 
 
 def things_rows(things: Mapping[str, Any]) -> list[list[str]]:
-    """Return what is seen of each thing, for a table, from its name to
+    """Return what is visible of each thing, for a table, from its name to
     `runs.results.ThingSeen` as a mapping.
     """
     rows = []
-    for name, seen in things.items():
-        share = (
-            "nothing"
-            if seen["box"] is None
-            else "in part"
-            if seen["share"] is None
-            else percent(seen["share"])
-        )
-        box = "" if seen["box"] is None else ", ".join(map(str, seen["box"]))
-        rows.append(
-            [
-                name,
-                share,
-                box,
-                "" if seen["distance"] is None else f"{seen['distance']:.1f} m",
-            ]
-        )
+    for name, thing in things.items():
+        if thing["box"] is None:
+            visible = "nothing"
+        elif thing["share"] is None:
+            visible = "in part"
+        else:
+            visible = percent(thing["share"])
+        box = "" if thing["box"] is None else ", ".join(map(str, thing["box"]))
+        distance = "" if thing["distance"] is None else f"{thing['distance']:.1f} m"
+        rows.append([name, visible, box, distance])
     return rows
 
 
@@ -365,7 +363,9 @@ def calls(task: str, thing: str, label: str, outcome: Outcome | None = None) -> 
     if task == DEPTH:
         return f"judges {thing} {label}"
     if task in (DETECTION, SEGMENTATION, SIMILARITY):
-        return f"takes {thing} for {label if label in WHOLE and task != DETECTION else with_article(label)}"
+        if label in WHOLE and task != DETECTION:
+            return f"takes {thing} for {label}"
+        return f"takes {thing} for {with_article(label)}"
     return f'predicts "{label}" for {thing}'
 
 
@@ -444,18 +444,18 @@ def rate_text(rated: VerifiedRate) -> str:
     """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``; and how many outputs
     are not numbers.
     """
-    nothing = (
+    nan_text = (
         f"in {rated.not_a_number} its output is not a number"
         if rated.not_a_number
         else ""
     )
-    if nothing and not rated.successes:
-        return f"none of {rated.trials} fresh renders: {nothing}"
+    if nan_text and not rated.successes:
+        return f"none of {rated.trials} fresh renders: {nan_text}"
     rate = (
         f"{rated.successes} of {rated.trials} fresh renders (95 % interval "
         f"{interval_text(rated.interval)})"
     )
-    return f"{rate}, and {nothing}" if nothing else rate
+    return f"{rate}, and {nan_text}" if nan_text else rate
 
 
 def rated_cells(rated: VerifiedRate | ControlGroup) -> list[str]:
@@ -463,30 +463,28 @@ def rated_cells(rated: VerifiedRate | ControlGroup) -> list[str]:
     outputs that are not numbers, how many.
     """
     number = rated.successes if hasattr(rated, "successes") else rated.correct
-    nothing = f", {rated.not_a_number} not a number" if rated.not_a_number else ""
-    return [f"{number}/{rated.trials}{nothing}", interval_text(rated.interval)]
+    nan_text = f", {rated.not_a_number} not a number" if rated.not_a_number else ""
+    return [f"{number}/{rated.trials}{nan_text}", interval_text(rated.interval)]
 
 
 def tally(what: str, number: int, trials: int, not_a_number: int = 0) -> str:
     """Return ``wrong in 20 of 20``; of outputs that are not numbers, how many."""
-    nothing = f"not a number in {not_a_number} of {trials}"
+    nan_text = f"not a number in {not_a_number} of {trials}"
     if not not_a_number:
         return f"{what} in {number} of {trials}"
-    return f"{what} in {number}, {nothing}" if number else nothing
+    return f"{what} in {number}, {nan_text}" if number else nan_text
 
 
 def seconds_text(seconds: Any) -> str:
     """Return ``14.6 s``, ``3 min 5 s`` or ``2 h 10 min``."""
     if seconds is None:
         return "unknown"
-    whole = round(float(seconds))
-    if whole < 100:
+    total = round(float(seconds))
+    if total < 100:
         return f"{float(seconds):.1f} s"
-    return (
-        f"{whole // 60} min {whole % 60} s"
-        if whole < 6000
-        else f"{whole // 3600} h {whole % 3600 // 60} min"
-    )
+    if total < 6000:
+        return f"{total // 60} min {total % 60} s"
+    return f"{total // 3600} h {total % 3600 // 60} min"
 
 
 def count(number: Any, thing: str) -> str:
@@ -495,28 +493,23 @@ def count(number: Any, thing: str) -> str:
 
 
 def workers_text(shared: SharedWork | None) -> str:
-    """How many shared the work, and where their time went; empty where nothing was
-    shared.
+    """Return how many workers shared the work, and where their time went; empty if
+    nothing was shared.
     """
     if shared is None:
         return ""
-    busy = (
-        None
-        if shared.utilisation is None
-        else f"busy {percent(shared.utilisation)} of {seconds_text(shared.alive)}"
-    )
+    texts = [f"{shared.most} at most"]
+    if shared.utilisation is not None:
+        alive = seconds_text(shared.alive)
+        texts.append(f"busy {percent(shared.utilisation)} of {alive}")
+    texts.append(f"loading took {seconds_text(shared.loading)}")
     counts = {
         "lost": shared.lost,
         "refused": shared.refused,
         "given out again": shared.retried,
     }
-    listed = [f"{number} {what}" for what, number in counts.items() if number]
-    first = [
-        f"{shared.most} at most",
-        busy,
-        f"loading took {seconds_text(shared.loading)}",
-    ]
-    return ", ".join(filter(None, [*first, *listed]))
+    texts += [f"{count} {event}" for event, count in counts.items() if count]
+    return ", ".join(texts)
 
 
 def formation_text(
@@ -526,26 +519,22 @@ def formation_text(
     exposure 0 stops, gain 1.35``; gains of several scenes by their names.
     """
     height, width = formation.resolution
-    denoised = (
-        "not denoised"
-        if formation.denoiser == "none"
-        else f"denoised ({formation.denoiser})"
-    )
-    exposure = f"exposure {number_text(formation.exposure)} stops"
-    made = (
-        f"{height} x {width} pixels, {formation.filter} filter, {denoised}, {exposure}"
+    denoised = "not denoised"
+    if formation.denoiser != "none":
+        denoised = f"denoised ({formation.denoiser})"
+    description = (
+        f"{height} x {width} pixels, {formation.filter} filter, {denoised}, "
+        f"exposure {number_text(formation.exposure)} stops, "
+        f"sampler {formation.sampler}"
     )
     if formation.gain is not None:
-        return (
-            f"{made}, sampler {formation.sampler}, gain {number_text(formation.gain)}"
-        )
-    names = {name: ", ".join(map(short_name, name.split(", "))) for name in gains or {}}
-    each = "; ".join(
-        f"{names[name]} {number_text(value)}" for name, value in (gains or {}).items()
-    )
-    return f"{made}, sampler {formation.sampler}, a gain for each scene" + (
-        f": {each}" if each else ""
-    )
+        return f"{description}, gain {number_text(formation.gain)}"
+    gain_texts = []
+    for scene, gain in (gains or {}).items():
+        scene_name = ", ".join(map(short_name, scene.split(", ")))
+        gain_texts.append(f"{scene_name} {number_text(gain)}")
+    description += ", a gain for each scene"
+    return f"{description}: {'; '.join(gain_texts)}" if gain_texts else description
 
 
 def number_text(value: Any) -> str:
@@ -556,7 +545,7 @@ def number_text(value: Any) -> str:
 
 
 def conditions_text(conditions: Sequence[ConditionRow]) -> str:
-    return " and ".join(one.text for one in conditions) or (
+    return " and ".join(condition.text for condition in conditions) or (
         "everything that was looked at"
     )
 

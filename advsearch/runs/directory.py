@@ -66,9 +66,16 @@ BEGUN_WITH = "settings"  # the note of settings that decide the run's numbers
 LONGEST_VALUE = 40  # characters of a value that an error states
 
 CONTENTS = (
-    CONFIG, *(f"{store.NAME}{ending}" for ending in ("", "-wal", "-shm", "-journal")), summary.NAME, REPORT, COLUMNS,
-    IMAGES, ARTIFACTS, AOV_FOLDER, PARTS,
-)  # fmt: skip
+    CONFIG,
+    *(f"{store.NAME}{ending}" for ending in ("", "-wal", "-shm", "-journal")),
+    summary.NAME,
+    REPORT,
+    COLUMNS,
+    IMAGES,
+    ARTIFACTS,
+    AOV_FOLDER,
+    PARTS,
+)
 """All that a run writes. `overwrite` removes these and nothing else."""
 
 
@@ -121,24 +128,24 @@ class RunDirectory:
             path.mkdir(parents=True, exist_ok=True)
         try:
             with ExitStack() as undo:
-                held = RunLock(path)
-                undo.callback(held.release)
+                lock = RunLock(path)
+                undo.callback(lock.release)
                 check_free(path, overwrite=overwrite)
                 with storage_errors(path):
                     _clear(path)
                 try:
                     if config is not None:
                         write_text(path / CONFIG, config.make_repeatable().to_yaml())
-                    made = cls(path, held)
-                    undo.callback(made.store.close)
+                    run_directory = cls(path, lock)
+                    undo.callback(run_directory.store.close)
                     if config is not None:
-                        made._note_start(config)
+                        run_directory._note_start(config)
                 except BaseException:
                     with suppress(OSError):
                         _clear(path)
                     raise
                 undo.pop_all()
-                return made
+                return run_directory
         except InputError:  # it is another's
             raise
         except BaseException:
@@ -162,9 +169,10 @@ class RunDirectory:
         """Make the directory that `config` asks for, with its `run.yaml`; errors as for
         `create`.
         """
-        (place, overwrite), (first, *others) = config.run_location, config.title_words
+        location, overwrite = config.run_location
+        first, *others = config.title_words
         return cls.create(
-            place,
+            location,
             config=config,
             overwrite=overwrite,
             default=default_name(first, others),
@@ -180,9 +188,9 @@ class RunDirectory:
         path = find_run(run)
         check_links(path)
         with ExitStack() as undo:
-            held = RunLock(path)
-            undo.callback(held.release)
-            opened = cls(path, held)
+            lock = RunLock(path)
+            undo.callback(lock.release)
+            opened = cls(path, lock)
             undo.callback(opened.close)
             opened._began = False
             if config is not None:
@@ -238,16 +246,16 @@ class RunDirectory:
         stored = self.store.noted(note)
         before = {} if stored is None else stored
         if not isinstance(before, dict):
-            got = type(before).__name__
+            type_name = type(before).__name__
             raise FileFormatError(
                 f"{self.store.path}: expected what the run began with in the note "
-                f"{note!r}, got {got}"
+                f"{note!r}, got {type_name}"
             )
         if changed := summary.changed_facts(before, facts):
-            listed = ", ".join(_with_value(name, before.get(name)) for name in changed)
+            changes = ", ".join(_with_value(name, before.get(name)) for name in changed)
             raise InputError(
                 f"{self.path}: cannot resume with something else than the run began "
-                f"with: {listed}; restore it, or "
+                f"with: {changes}; restore it, or "
                 f"{self.again}"
             )
         if not facts.keys() <= before.keys():
@@ -385,12 +393,14 @@ def begun(config: Config) -> Iterator[Path | None]:
     raises before anything was evaluated, nothing is left of it. It is None for a run
     that takes the place of another one, which stays until then.
     """
-    place, overwrite = config.run_location
-    if overwrite and place is not None and is_run(run_path(place)):
+    location, overwrite = config.run_location
+    if overwrite and location is not None and is_run(run_path(location)):
         yield None
         return
-    home = HOME if place is None else run_path(place).parent
-    above = [one for one in (home, *home.parents) if not os.path.exists(one)]
+    home = HOME if location is None else run_path(location).parent
+    missing_folders = [
+        parent for parent in (home, *home.parents) if not os.path.exists(parent)
+    ]
     with RunDirectory.create_for(config) as run:
         path = run.path
     try:
@@ -400,7 +410,7 @@ def begun(config: Config) -> Iterator[Path | None]:
             if run.is_empty:
                 run.discard()
         with suppress(OSError):
-            for folder in above:
+            for folder in missing_folders:
                 folder.rmdir()
         raise
 
@@ -503,8 +513,10 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
             "choose another name with `run`"
         )
     with storage_errors(path):
-        bare = not path.exists() or all(_is_leftover(found) for found in path.iterdir())
-    if bare:
+        is_free = not path.exists() or all(
+            _is_leftover(entry) for entry in path.iterdir()
+        )
+    if is_free:
         return
     if not is_run(path):
         raise RunExistsError(
@@ -522,12 +534,12 @@ def _numbered(default: str) -> Path:
     pattern = re.compile(re.escape(default) + r"-(\d{3,})")
     with storage_errors(HOME):
         HOME.mkdir(parents=True, exist_ok=True)
-        taken = [
-            int(found[1])
+        used_numbers = [
+            int(match[1])
             for path in HOME.iterdir()
-            if (found := pattern.fullmatch(path.name))
+            if (match := pattern.fullmatch(path.name))
         ]
-        for number in itertools.count(max(taken, default=0) + 1):
+        for number in itertools.count(max(used_numbers, default=0) + 1):
             path = HOME / f"{default}-{number:03d}"
             try:
                 path.mkdir()
@@ -538,12 +550,12 @@ def _numbered(default: str) -> Path:
 
 
 def _clear(path: Path) -> None:
-    for found in list(path.iterdir()):
-        if found.name in CONTENTS or found.name.startswith(PART):
-            if found.is_dir() and not found.is_symlink():
-                shutil.rmtree(found)
+    for entry in list(path.iterdir()):
+        if entry.name in CONTENTS or entry.name.startswith(PART):
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
             else:
-                found.unlink()
+                entry.unlink()
 
 
 def _known_settings(config: Config) -> dict[str, Any]:
@@ -569,7 +581,7 @@ def _is_leftover(path: Path) -> bool:
 
 def _remove_if_bare(path: Path) -> None:
     with suppress(OSError):
-        if all(_is_leftover(found) for found in path.iterdir()):
-            for found in list(path.iterdir()):
-                found.unlink()
+        if all(_is_leftover(entry) for entry in path.iterdir()):
+            for entry in list(path.iterdir()):
+                entry.unlink()
             path.rmdir()

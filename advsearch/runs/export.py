@@ -77,20 +77,20 @@ def as_columns(rows: Iterable[Row]) -> list[str]:
     which they first occur.
     """
     metrics = dict[str, None]()
-    seen = dict[str, None]()
+    values = dict[str, None]()
     for row in rows:
         metrics |= dict.fromkeys(row.metrics)
-        seen |= dict.fromkeys(_values(row.values))
-    return [*OWN, *metrics, *seen, *AFTER]
+        values |= dict.fromkeys(_values(row.values))
+    return [*OWN, *metrics, *values, *AFTER]
 
 
 def as_record(row: Row) -> JsonObject:
-    own = {
-        one.name: getattr(row, one.name)
-        for one in fields(row)
-        if one.name not in ("values", "metrics")
+    columns = {
+        field.name: getattr(row, field.name)
+        for field in fields(row)
+        if field.name not in ("values", "metrics")
     }
-    return own | dict(row.metrics) | _values(row.values)
+    return columns | dict(row.metrics) | _values(row.values)
 
 
 def each_value(
@@ -99,16 +99,17 @@ def each_value(
     """Yield values by name with their units; of several numbers each, as
     ``camera.target[0]``.
     """
-    for name, told in values.items():
+    for name, entry in values.items():
         value, unit = (
-            (told.get("value"), told.get("unit"))
-            if isinstance(told, Mapping)
-            else (told, None)
+            (entry.get("value"), entry.get("unit"))
+            if isinstance(entry, Mapping)
+            else (entry, None)
         )
         unit = str(unit or "")
         if isinstance(value, (list, tuple)):
             yield from (
-                (f"{name}[{number}]", inner, unit) for number, inner in enumerate(value)
+                (f"{name}[{index}]", component, unit)
+                for index, component in enumerate(value)
             )
         else:
             yield name, value, unit
@@ -149,9 +150,11 @@ def _flat(record: JsonObject) -> JsonObject:
 
 def _json(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:
     stream.write(b"[")
-    for number, one in enumerate(records):
+    for number, record in enumerate(records):
         line = json.dumps(
-            {name: one.get(name) for name in names}, allow_nan=False, ensure_ascii=False
+            {name: record.get(name) for name in names},
+            allow_nan=False,
+            ensure_ascii=False,
         )
         stream.write((",\n " if number else "\n ").encode() + line.encode())
     stream.write(b"\n]\n")
@@ -160,51 +163,60 @@ def _json(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) ->
 def _parquet(
     records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
 ) -> None:
+    """Write records as Parquet, of which `GROUP` are in memory at once."""
     try:
         # comes with the extra `parquet`
-        import pyarrow
         import pyarrow.parquet
     except ImportError:
         raise InputError(
             "format parquet: needs pyarrow; pip install pyarrow, or choose csv or json"
         ) from None
     rows = map(_flat, records)
-    first = list(itertools.islice(rows, GROUP))
-    arrow = {
+    group = list(itertools.islice(rows, GROUP))
+    schema = _make_schema(names, group)
+    with pyarrow.parquet.ParquetWriter(stream, schema) as writer:
+        while group:
+            columns: dict[str, list[Any]] = {}
+            for name, arrow_type in zip(names, schema.types, strict=True):
+                values = [record.get(name) for record in group]
+                columns[name] = _convert_column(values, arrow_type)
+            writer.write_table(pyarrow.table(columns, schema))
+            group = list(itertools.islice(rows, GROUP))
+
+
+def _make_schema(names: list[str], first_records: Sequence[JsonObject]) -> Any:
+    """Return the Arrow schema of columns: of metrics and values, which have no declared
+    type, text where one of the first records has text, else float64.
+    """
+    import pyarrow
+
+    arrow_types = {
         "str": pyarrow.string(),
         "bool": pyarrow.bool_(),
         "int": pyarrow.int64(),
         "float": pyarrow.float64(),
     }
-    kinds = {
-        one.name: arrow.get(str(one.type).partition(" ")[0], arrow["str"])
-        for one in fields(Row)
-    }
+    type_of_column = {}
+    for field in fields(Row):
+        python_type = str(field.type).partition(" ")[0]
+        type_of_column[field.name] = arrow_types.get(python_type, arrow_types["str"])
     for name in set(names) - {*OWN, *AFTER}:
-        kinds[name] = arrow[
-            "str"
-            if any(isinstance(record.get(name), str) for record in first)
-            else "float"
-        ]
-    schema = pyarrow.schema([(name, kinds[name]) for name in names])
-    with pyarrow.parquet.ParquetWriter(stream, schema) as writer:
-        while first:
-            columns: dict[str, list[Any]] = {}
-            for name, kind in zip(names, schema.types, strict=True):
-                made: Any = (
-                    str
-                    if kind == pyarrow.string()
-                    else float
-                    if kind == pyarrow.float64()
-                    else None
-                )
-                values = [record.get(name) for record in first]
-                columns[name] = [
-                    made(value) if made and value is not None else value
-                    for value in values
-                ]
-            writer.write_table(pyarrow.table(columns, schema))
-            first = list(itertools.islice(rows, GROUP))
+        has_text = any(isinstance(record.get(name), str) for record in first_records)
+        type_of_column[name] = arrow_types["str" if has_text else "float"]
+    return pyarrow.schema([(name, type_of_column[name]) for name in names])
+
+
+def _convert_column(values: list[Any], arrow_type: Any) -> list[Any]:
+    """Return values as text or float where the column has that type, None as it is."""
+    import pyarrow
+
+    if arrow_type == pyarrow.string():
+        convert: Any = str
+    elif arrow_type == pyarrow.float64():
+        convert = float
+    else:
+        return values
+    return [None if value is None else convert(value) for value in values]
 
 
 DETAILS = "details.log"
@@ -252,51 +264,68 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
 def _imported(
     folder: Path, number: int, line: bytes, classes: Sequence[str]
 ) -> tuple[Row, Path | None]:
+    """Return a line of 3DB's log as a row, and the file of its picture, if any.
+
+    Raises:
+        FileFormatError: the line, the `number`-th from 0, is not as 3DB writes it.
+    """
     try:
-        told = parse_json(line.decode())
+        record = parse_json(line.decode())
     except ValueError as error:
         raise _wrong(folder, number, str(error)) from None
-    if not isinstance(told, dict) or not isinstance(told.get("render_args"), dict):
+    if not isinstance(record, dict) or not isinstance(record.get("render_args"), dict):
         raise _wrong(folder, number, "a line without render_args")
-    values: dict[str, Value] = {
-        "object": _value(told.get("model")),
-        "environment": _value(told.get("environment")),
-    }
-    for name, value in told["render_args"].items():
-        if isinstance(value, list):
-            values |= {
-                f"{name}[{place}]": _value(inner) for place, inner in enumerate(value)
-            }
-        else:
-            values["model" if name == "network" else name] = _value(value)
-    prediction = told.get("prediction")
-    first = prediction[0] if isinstance(prediction, list) and prediction else prediction
-    index = int(first) if _is_number(first) else None
-    label = (
-        classes[index]
-        if index is not None and 0 <= index < len(classes)
-        else ""
-        if index is None
-        else str(index)
-    )
-    loss = told.get("loss")
-    margin = 0.0 - loss if isinstance(loss, (int, float)) else None
-    right = str(told.get("is_correct")) == "True"
+    label, label_index = _parse_prediction(record.get("prediction"), classes)
+    loss = record.get("loss")
     row = Row(
         "sweep",
         number,
-        correct=right,
-        margin=margin,
+        correct=str(record.get("is_correct")) == "True",
+        margin=0.0 - loss if isinstance(loss, (int, float)) else None,
         label=label,
-        label_index=index,
-        values=values,
+        label_index=label_index,
+        values=_import_values(record),
     )
-    picture = folder / IMAGES / f"{told.get('id')}_rgb.png"
-    safe = re.fullmatch(r"[A-Za-z0-9_-]{1,100}", str(told.get("id")))
-    return (
-        row,
-        picture if safe and picture.is_file() and not picture.is_symlink() else None,
-    )
+    return row, _find_picture(folder, str(record.get("id")))
+
+
+def _import_values(record: JsonObject) -> dict[str, Value]:
+    """Return the parameters of a line of 3DB's log, those of lists by their index."""
+    values: dict[str, Value] = {
+        "object": _value(record.get("model")),
+        "environment": _value(record.get("environment")),
+    }
+    for name, value in record["render_args"].items():
+        if isinstance(value, list):
+            for index, component in enumerate(value):
+                values[f"{name}[{index}]"] = _value(component)
+        else:
+            values["model" if name == "network" else name] = _value(value)
+    return values
+
+
+def _parse_prediction(
+    prediction: JsonValue, classes: Sequence[str]
+) -> tuple[str, int | None]:
+    """Return label and index of the first class of a prediction; a class without a name
+    is called by its index, and "" is no class.
+    """
+    first = prediction[0] if isinstance(prediction, list) and prediction else prediction
+    if not _is_number(first):
+        return "", None
+    index = int(first)
+    label = classes[index] if 0 <= index < len(classes) else str(index)
+    return label, index
+
+
+def _find_picture(folder: Path, image_id: str) -> Path | None:
+    """Return the file of a picture, unless it is missing, a link, or its id is no plain
+    name.
+    """
+    if re.fullmatch(r"[A-Za-z0-9_-]{1,100}", image_id) is None:
+        return None
+    path = folder / IMAGES / f"{image_id}_rgb.png"
+    return path if path.is_file() and not path.is_symlink() else None
 
 
 def _is_number(value: JsonValue) -> TypeGuard[int | float]:

@@ -141,7 +141,7 @@ def check_version(db: sqlite3.Connection, path: Path) -> None:
     )
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # Pictures of a run, (H, W, 3) or (H, W), of numpy or torch, as files: 8-bit PNG of sRGB
 # values, rounded as verification rounds them, so that the file is exactly what was
 # classified; EXR in float32; an animation of the search.
@@ -241,9 +241,9 @@ def write_layers(
     channels = {}
     for name, layer in layers.items():
         values = layer.numpy() if hasattr(layer, "numpy") else np.asarray(layer)
-        whole = values.dtype.kind in "iu"
+        is_integer = values.dtype.kind in "iu"
         channels[name] = np.ascontiguousarray(
-            values.astype(np.uint32 if whole else np.float32)
+            values.astype(np.uint32 if is_integer else np.float32)
         )
     return _write_exr(path, channels, notes)
 
@@ -277,9 +277,9 @@ def animation_bytes(frames: Sequence[Any]) -> bytes:
     shrink = 1
     while True:
         # the first and the last among them
-        chosen = np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)
+        indices = np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)
         pictures = [
-            Image.fromarray(_picture(to_8bit(frames[place]))) for place in chosen
+            Image.fromarray(_picture(to_8bit(frames[index]))) for index in indices
         ]
         block = max(shrink, -(-max(pictures[0].size) * shrink // ANIMATION_SIDE))
         width, height = (

@@ -136,13 +136,27 @@ def _as_far_as_read(
         else str(getattr(result, "ending", "done"))
     )
     return Listed(
-        path.name, str(path), command=str(config.get("command") or (result.command if result else "?")),
+        path.name,
+        str(path),
+        command=str(config.get("command") or (result.command if result else "?")),
         object=str(config.get("object") or object_name or ("" if config else "?")),
-        controls=tuple(map(str, controls)) if isinstance(controls, (list, tuple, dict)) else ("?",),
-        rows=sum(kinds.values()), state="running" if running else ending, answer=result.brief if result else "",
-        kinds=kinds, begun=bool(config),
-        when=next((file.stat().st_mtime for file in (path / CONFIG, path / summary.NAME) if file.exists()), None),
-    )  # fmt: skip
+        controls=tuple(map(str, controls))
+        if isinstance(controls, (list, tuple, dict))
+        else ("?",),
+        rows=sum(kinds.values()),
+        state="running" if running else ending,
+        answer=result.brief if result else "",
+        kinds=kinds,
+        begun=bool(config),
+        when=next(
+            (
+                file.stat().st_mtime
+                for file in (path / CONFIG, path / summary.NAME)
+                if file.exists()
+            ),
+            None,
+        ),
+    )
 
 
 @contextmanager

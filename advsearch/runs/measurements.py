@@ -96,20 +96,20 @@ class Measurements:
         first.
         """
         context = self._context
-        taken: list[Row] = []
+        collected_rows: list[Row] = []
         context.ending = INTERRUPTED
         try:
             with interruptible():
                 for row in rows:
-                    taken.append(row)
+                    collected_rows.append(row)
                     if self.made:
-                        context.run.write_summary(make_result(taken))
+                        context.run.write_summary(make_result(collected_rows))
                 context.ending = "done"
         except KeyboardInterrupt:
             pass
         except OutOfTime:
             context.ending = OUT_OF_TIME
-        result = make_result(taken)
+        result = make_result(collected_rows)
         if (
             context.ending == INTERRUPTED
             and not self.made

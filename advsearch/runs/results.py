@@ -257,8 +257,8 @@ def plain(value: Any) -> Any:
         return [plain(inner) for inner in value]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {
-            one.name: plain(getattr(value, one.name))
-            for one in dataclasses.fields(value)
+            field.name: plain(getattr(value, field.name))
+            for field in dataclasses.fields(value)
         }
     if hasattr(value, "tolist"):
         return plain(value.tolist())
@@ -332,13 +332,13 @@ class Extent(Fields):
         """Return a count with the interval of its share, which is `share` where that is
         not count over total.
         """
-        own_share = share if total and share != count / total else None
+        stated_share = share if total and share != count / total else None
         return cls(
             what=what,
             count=count,
             total=total,
             interval=interval or (0.0, 1.0),
-            share=own_share,
+            share=stated_share,
         )
 
 

@@ -95,7 +95,8 @@ class Told:
 _TOLD = "number, u, non_finite, cost, gradient, picture, height"
 _AS_JSON = ("payload", "values", "metrics")
 _COLUMNS = tuple(
-    f"{one.name}_json" if one.name in _AS_JSON else one.name for one in fields(Row)
+    f"{field.name}_json" if field.name in _AS_JSON else field.name
+    for field in fields(Row)
 )
 _INSERT = (
     f"INSERT INTO evaluations ({', '.join(_COLUMNS)}) VALUES "
@@ -146,20 +147,22 @@ class Store:
         step are there already changes nothing. What it `told` is that of the last one.
         """
         check_there(self.path)
-        began = time.monotonic()
-        stamp = time.time()
-        force = began >= self._next_sync
+        start_time = time.monotonic()
+        timestamp = time.time()
+        must_sync = start_time >= self._next_sync
         with storage_errors(self.path):
-            self._db.execute(f"PRAGMA synchronous = {'FULL' if force else 'NORMAL'}")
+            self._db.execute(
+                f"PRAGMA synchronous = {'FULL' if must_sync else 'NORMAL'}"
+            )
             with self._db:
-                self._db.executemany(_INSERT, (_encode(row, stamp) for row in rows))
+                self._db.executemany(_INSERT, (_encode(row, timestamp) for row in rows))
                 if told is not None:
                     arrays = [
                         None if array is None else array.tobytes()
                         for array in (told.gradient, told.picture)
                     ]
                     height = None if told.picture is None else len(told.picture)
-                    beside = (
+                    search_values = (
                         told.number,
                         told.u,
                         told.non_finite,
@@ -168,15 +171,17 @@ class Store:
                         height,
                     )
                     self._db.execute(
-                        _INSERT_TOLD, (*beside, rows[-1].kind, rows[-1].step)
+                        _INSERT_TOLD, (*search_values, rows[-1].kind, rows[-1].step)
                     )
-        if force:
-            ended = time.monotonic()
-            self._next_sync = ended + max(SYNC_INTERVAL, (ended - began) / SYNC_SHARE)
+        if must_sync:
+            end_time = time.monotonic()
+            self._next_sync = end_time + max(
+                SYNC_INTERVAL, (end_time - start_time) / SYNC_SHARE
+            )
 
-    def _select(self, what: str, *given: Any) -> Iterator[Any]:
+    def _select(self, query: str, *parameters: Any) -> Iterator[Any]:
         with readable(self.path):
-            cursor = self._db.execute(f"SELECT {what}", given)
+            cursor = self._db.execute(f"SELECT {query}", parameters)
             row = cursor.fetchone()
         while row is not None:
             yield row
@@ -187,13 +192,14 @@ class Store:
         """Yield the rows, or those of one kind, in the order in which they were
         written, behind the id `after`.
         """
-        where, given = (
+        condition, parameters = (
             ("id > ?", [after])
             if kind is None
             else ("id > ? AND kind = ?", [after, kind])
         )
         for values in self._select(
-            f"{', '.join(_COLUMNS)} FROM evaluations WHERE {where} ORDER BY id", *given
+            f"{', '.join(_COLUMNS)} FROM evaluations WHERE {condition} ORDER BY id",
+            *parameters,
         ):
             yield _decode(values, self.path)
 
@@ -213,12 +219,14 @@ class Store:
         run is done.
         """
         row = self.row(kind, step)
-        found = (
+        values = (
             None
             if row is None
             else next(self._select(f"{_TOLD} FROM told WHERE row = ?", row.id), None)
         )
-        return None if row is None or found is None else (row, _told(found, self.path))
+        return (
+            None if row is None or values is None else (row, _told(values, self.path))
+        )
 
     def pictures(
         self, kind: str, after: int, until: int
@@ -226,15 +234,15 @@ class Store:
         """Yield number and picture of what rows of a kind with ids over `after` have
         told, while the run goes on.
         """
-        what = (
+        query = (
             "number, u, non_finite, cost, NULL, picture, height FROM told JOIN "
             "evaluations ON row = id "
             "WHERE kind = ? AND id > ? AND id <= ? AND picture IS NOT NULL ORDER BY id"
         )
-        for values in self._select(what, kind, after, until):
-            one = _told(values, self.path)
-            assert one.picture is not None
-            yield one.number, one.picture
+        for values in self._select(query, kind, after, until):
+            evaluation = _told(values, self.path)
+            assert evaluation.picture is not None
+            yield evaluation.number, evaluation.picture
 
     @property
     def goes_on(self) -> bool:
@@ -246,8 +254,8 @@ class Store:
         check_there(self.path)
         with storage_errors(self.path):
             with self._db:
-                anything = self._db.execute("DELETE FROM told").rowcount
-            if anything:
+                n_deleted = self._db.execute("DELETE FROM told").rowcount
+            if n_deleted:
                 self._db.execute("VACUUM")
 
     def last_step(self, kind: str) -> int:
@@ -260,8 +268,12 @@ class Store:
         )
 
     def count(self, kind: str | None = None) -> int:
-        where, given = ("", []) if kind is None else (" WHERE kind = ?", [kind])
-        return int(next(self._select(f"count(*) FROM evaluations{where}", *given))[0])
+        condition, parameters = (
+            ("", []) if kind is None else (" WHERE kind = ?", [kind])
+        )
+        return int(
+            next(self._select(f"count(*) FROM evaluations{condition}", *parameters))[0]
+        )
 
     def missing(self, kind: str, count: int) -> Iterator[range]:
         """Yield the steps from 0 to `count` of which there is no row of a kind,
@@ -330,7 +342,7 @@ class Store:
         self.close()
 
 
-_FIELDS = tuple(one.name for one in fields(Row))
+_FIELDS = tuple(field.name for field in fields(Row))
 _OTHERS = _FIELDS[:-2]  # without the time and the id
 _SIMPLE = frozenset({str, int, bool, type(None)})
 _JSON = json.JSONEncoder(allow_nan=False)
@@ -370,41 +382,41 @@ MOST_STEPS = (1 << 32) - 1
 
 
 def _decode(values: tuple[Any, ...], path: Path) -> Row:
-    given = dict(zip(_FIELDS, values, strict=True))
-    wrong = [
+    by_name = dict(zip(_FIELDS, values, strict=True))
+    wrong_columns = [
         name
-        for name, value in given.items()
+        for name, value in by_name.items()
         if not isinstance(value, _TYPES[name]) or value in _INFINITE
     ]
-    if not wrong and not 0 <= given["step"] <= MOST_STEPS:
-        wrong = ["step"]
-    if not wrong:
-        given["values"] = _named(given["values"], _is_value)
-        given["metrics"] = (
-            {} if given["metrics"] is None else _named(given["metrics"], _is_metric)
+    if not wrong_columns and not 0 <= by_name["step"] <= MOST_STEPS:
+        wrong_columns = ["step"]
+    if not wrong_columns:
+        by_name["values"] = _named(by_name["values"], _is_value)
+        by_name["metrics"] = (
+            {} if by_name["metrics"] is None else _named(by_name["metrics"], _is_metric)
         )
-        wrong = [
-            f"{name}_json" for name in ("values", "metrics") if given[name] is None
+        wrong_columns = [
+            f"{name}_json" for name in ("values", "metrics") if by_name[name] is None
         ]
-    if not wrong and given["payload"] is not None:
+    if not wrong_columns and by_name["payload"] is not None:
         try:
-            given["payload"] = parse_json(given["payload"], finite=True)
+            by_name["payload"] = parse_json(by_name["payload"], finite=True)
         except ValueError:
-            wrong = ["payload_json"]
-    if wrong:
+            wrong_columns = ["payload_json"]
+    if wrong_columns:
         raise FileFormatError(
-            f"{path}: row {given['id']!r}: expected another type of "
-            f"{wrong[0]}; {DAMAGED}"
+            f"{path}: row {by_name['id']!r}: expected another type of "
+            f"{wrong_columns[0]}; {DAMAGED}"
         )
     for name in ("success", "correct"):
-        given[name] = None if given[name] is None else bool(given[name])
-    return Row(**given)
+        by_name[name] = None if by_name[name] is None else bool(by_name[name])
+    return Row(**by_name)
 
 
 def _told(values: tuple[Any, ...], path: Path) -> Told:
     number, u, non_finite, cost, gradient, picture, height = values
     try:
-        if [type(one) for one in (number, u, non_finite, cost)] != [
+        if [type(value) for value in (number, u, non_finite, cost)] != [
             int,
             bytes,
             int,
@@ -438,14 +450,14 @@ def _named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | None:
     return named if isinstance(named, dict) and all(map(fits, named.values())) else None
 
 
-def _is_value(told: object) -> bool:
+def _is_value(entry: object) -> bool:
     if (
-        not isinstance(told, dict)
-        or not isinstance(told.get("unit"), str)
-        or "value" not in told
+        not isinstance(entry, dict)
+        or not isinstance(entry.get("unit"), str)
+        or "value" not in entry
     ):
         return False
-    values = told["value"] if isinstance(told["value"], list) else [told["value"]]
+    values = entry["value"] if isinstance(entry["value"], list) else [entry["value"]]
     return all(isinstance(value, str) or _is_metric(value) for value in values)
 
 

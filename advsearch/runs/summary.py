@@ -206,14 +206,14 @@ def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
         names.add(DEFAULT_ENVIRONMENT)
     digests = dict[str, str]()
     for folder, kind in BUNDLED.items():
-        for place in sorted((package / "bundled" / "data" / folder).iterdir()):
-            if place.stem in names:
-                files = sorted(place.iterdir()) if place.is_dir() else [place]
-                parts = "".join(
+        for entry in sorted((package / "bundled" / "data" / folder).iterdir()):
+            if entry.stem in names:
+                files = sorted(entry.iterdir()) if entry.is_dir() else [entry]
+                listing = "".join(
                     f"{file.name} {_digest(file)}\n" for file in files if file.is_file()
                 )
-                digests[f"bundled {kind} {place.stem}"] = hashlib.sha256(
-                    parts.encode()
+                digests[f"bundled {kind} {entry.stem}"] = hashlib.sha256(
+                    listing.encode()
                 ).hexdigest()
     weights = package / "models" / "data" / "reference.safetensors"
     if "reference" in _bundled_names(settings.get("model")) and weights.is_file():
@@ -266,38 +266,49 @@ def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
     that was read for it: materials, pictures and buffers that a mesh or a scene names.
     A folder has one for all. What is bundled or gone has none.
     """
-    found: dict[str, str] = {}
+    digests: dict[str, str] = {}
     for name, value in settings.items():
         for path in _paths(value):
             with suppress(OSError, ValueError):
-                own = os.path.abspath(path)
-                parts = opened_for(own)
-                folder = (
-                    path
-                    if os.path.isabs(path)
-                    else path.removeprefix("hf:")
-                    if path.startswith("hf:")
-                    else ""
-                )
-                if folder and name in FOLDERS and Path(folder).is_dir():
-                    files = filter(
-                        Path.is_file,
-                        sorted(islice(Path(folder).glob(FOLDERS[name]), MOST_FILES)),
-                    )
-                    inside = (
-                        f"{file.relative_to(folder).as_posix()}\n{_digest(file)}"
-                        for file in files
-                    )
-                    found[folder] = hashlib.sha256("".join(inside).encode()).hexdigest()
-                if (parts or name in FILES) and Path(path).is_file():
-                    found[path] = _digest(Path(path))
-                for part in parts:
-                    if part != own and Path(part).is_file():
-                        beside = os.path.relpath(part, os.path.dirname(own))
-                        found[os.path.join(os.path.dirname(path), beside)] = _digest(
-                            Path(part)
-                        )
-    return found
+                for file_name, digest in _iterate_digests(name, path):
+                    digests[file_name] = digest
+    return digests
+
+
+def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
+    """Yield names and digests of a folder or a file, and of what was read for it.
+
+    Raises:
+        OSError: a file cannot be read.
+        ValueError: it is no possible path.
+    """
+    absolute_path = os.path.abspath(path)
+    opened_files = opened_for(absolute_path)
+    folder = ""
+    if os.path.isabs(path):
+        folder = path
+    elif path.startswith("hf:"):
+        folder = path.removeprefix("hf:")
+    if folder and setting in FOLDERS and Path(folder).is_dir():
+        yield folder, _digest_folder(Path(folder), FOLDERS[setting])
+    if (opened_files or setting in FILES) and Path(path).is_file():
+        yield path, _digest(Path(path))
+    for opened_file in opened_files:
+        if opened_file != absolute_path and Path(opened_file).is_file():
+            relative = os.path.relpath(opened_file, os.path.dirname(absolute_path))
+            file_name = os.path.join(os.path.dirname(path), relative)
+            yield file_name, _digest(Path(opened_file))
+
+
+def _digest_folder(folder: Path, pattern: str) -> str:
+    """Return one SHA-256 of the names and contents of the files that match a pattern."""
+    paths = sorted(islice(folder.glob(pattern), MOST_FILES))
+    lines = [
+        f"{path.relative_to(folder).as_posix()}\n{_digest(path)}"
+        for path in paths
+        if path.is_file()
+    ]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def _paths(value: object) -> Iterator[str]:
@@ -315,7 +326,7 @@ def _paths(value: object) -> Iterator[str]:
                 name.partition("#")[0],
                 *split_paths(name),
             )
-            yield from dict.fromkeys(one.strip() for one in parts if one.strip())
+            yield from dict.fromkeys(part.strip() for part in parts if part.strip())
 
 
 def _digest(path: Path) -> str:

@@ -24,7 +24,7 @@ from advsearch.options import NOT_A_NUMBER, get_outcome
 from advsearch.runs.export import as_columns, as_record, each_value
 from advsearch.runs.store import NAME, Row, Store
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # Which rows of a sweep are independent: those of different *units*, each of one draw. A
 # unit is a drive with all its frames, or a picture, with the predictions of all models
 # and, where one was swept, without and with the adversarial scene of a run. Where
@@ -82,12 +82,12 @@ class Units:
         picture = picture // self.noise
         if self.frames is None:
             return picture
-        place = picture // self.samples
+        point = picture // self.samples
         sample = picture % self.samples
         after = prod(self.sizes[self.frames + 1 :])
         # scenes are like one more axis, the slowest
-        before = place // (self.sizes[self.frames] * after)
-        return (before * after + place % after) * self.samples + sample
+        before = point // (self.sizes[self.frames] * after)
+        return (before * after + point % after) * self.samples + sample
 
 
 def units_of(store: Store, *, is_drawn: bool = True) -> Units | None:
@@ -126,7 +126,7 @@ SAID = ("id", "step", "correct", "margin", "probability", "seconds", "label", "o
 # rows that become numbers and names at once, so that a million rows fit
 AT_ONCE = 10_000
 # names that a parameter cannot have in a frame
-TAKEN = {*(one.name for one in fields(Row)), "unit", "outcome"}
+TAKEN = {*(field.name for field in fields(Row)), "unit", "outcome"}
 
 
 def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
@@ -135,10 +135,11 @@ def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
     A value is called ``pose.yaw``, and ``attrs["units"]["pose.yaw"]`` says its unit:
     "degrees".
     """
-    listed = list(rows)
-    names = {one: one.partition(" [")[0] for one in as_columns(listed)}
+    row_list = list(rows)
+    names = {column: column.partition(" [")[0] for column in as_columns(row_list)}
     records = [
-        {names[name]: value for name, value in as_record(row).items()} for row in listed
+        {names[name]: value for name, value in as_record(row).items()}
+        for row in row_list
     ]
     frame = pd.DataFrame(records, columns=list(names.values()))
     frame.attrs["units"] = {
@@ -193,21 +194,25 @@ def sweep_frame(
     ``attrs["units"]`` has the units of parameters.
     """
     units = dict[str, str]()
-    parts = list[pd.DataFrame]()
+    frames = list[pd.DataFrame]()
     cells = (
         {**_cells(row, number, units), **(also(row) if also else {})}
         for number, row in enumerate(rows, 1)
     )
-    while some := list(islice(cells, AT_ONCE)):
-        part = pd.DataFrame(some, dtype=object)
-        parts.append(
-            part.astype(
-                {name: float for name in part if not part[name].map(type).eq(str).any()}
+    while chunk := list(islice(cells, AT_ONCE)):
+        chunk_frame = pd.DataFrame(chunk, dtype=object)
+        frames.append(
+            chunk_frame.astype(
+                {
+                    name: float
+                    for name in chunk_frame
+                    if not chunk_frame[name].map(type).eq(str).any()
+                }
             )
         )
     frame = (
-        pd.concat(parts, ignore_index=True)
-        if parts
+        pd.concat(frames, ignore_index=True)
+        if frames
         else pd.DataFrame(dict.fromkeys(SAID, np.zeros(0)))
     )
     for name in frame.select_dtypes("object"):
@@ -222,7 +227,7 @@ def _cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
     """What is known of a row, the `number`-th, by column; `units` gets those of its
     parameters.
     """
-    said = (
+    fixed_values = (
         row.id or number,
         row.step,
         row.correct,
@@ -233,27 +238,31 @@ def _cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
     label = row.label or ("" if row.correct is None else NOT_A_NUMBER)
     outcome = get_outcome(row.payload)
     cells: dict[str, Any] = dict(
-        zip(SAID, (*said, label, "" if outcome is None else outcome.value), strict=True)
+        zip(
+            SAID,
+            (*fixed_values, label, "" if outcome is None else outcome.value),
+            strict=True,
+        )
     )
     for name, described in row.values.items():
-        called = f"parameter {name}" if name in TAKEN else name
-        for place, value, unit in each_value({called: described}):
-            units.setdefault(place, unit)
-            cells[place] = sys.intern(value) if isinstance(value, str) else value
+        parameter_name = f"parameter {name}" if name in TAKEN else name
+        for column, value, unit in each_value({parameter_name: described}):
+            units.setdefault(column, unit)
+            cells[column] = sys.intern(value) if isinstance(value, str) else value
     return cells
 
 
 def _names(column: pd.Series) -> pd.Categorical:
-    """A column that has names as categories, in the order in which they come; numbers
-    among them behind.
+    """Return a column that has names as categories, in the order in which they come;
+    numbers among them follow.
     """
-    texts = [
-        value
-        if isinstance(value, str)
-        else "none"
-        if pd.isna(value)
-        else f"{float(value):g}"
-        for value in column
-    ]
+    texts = list(map(_as_category, column))
     names = [value for value in column if isinstance(value, str)]
     return pd.Categorical(texts, categories=list(dict.fromkeys([*names, *texts])))
+
+
+def _as_category(value: Any) -> str:
+    """Return a name as it is, ``none`` for nothing, and a number as text."""
+    if isinstance(value, str):
+        return value
+    return "none" if pd.isna(value) else f"{float(value):g}"

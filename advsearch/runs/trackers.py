@@ -53,13 +53,13 @@ class Tracker:
         self._name = name
         self._right: dict[str, list[int]] = defaultdict(lambda: [0, 0])
         self._waiting: Queue[tuple[MetricValues, int] | None] = Queue(WAITING)
-        told = {
+        setting_texts = {
             key: str(value)[:LONGEST]
             for key, value in settings.items()
             if value is not None
         }
         self._thread = threading.Thread(
-            target=self._work, args=(folder, told), name=name, daemon=True
+            target=self._work, args=(folder, setting_texts), name=name, daemon=True
         )
         self._thread.start()
 
@@ -79,21 +79,22 @@ class Tracker:
         self._thread.join(PATIENCE)
 
     def _numbers(self, kind: str, rows: Sequence[Row]) -> MetricValues:
-        numbers = {}
+        metrics = {}
         for name in NUMBERS:
-            given = [
+            values = [
                 float(value)
                 for row in rows
                 if (value := getattr(row, name)) is not None
             ]
-            if given:
-                numbers[f"{kind}/{name}"] = sum(given) / len(given)
-        judged = [row.correct for row in rows if row.correct is not None]
+            if values:
+                metrics[f"{kind}/{name}"] = sum(values) / len(values)
+        is_right = [row.correct for row in rows if row.correct is not None]
         counts = self._right[kind]
-        counts[0], counts[1] = counts[0] + sum(judged), counts[1] + len(judged)
+        counts[0] += sum(is_right)
+        counts[1] += len(is_right)
         if counts[1]:
-            numbers[f"{kind}/accuracy"] = counts[0] / counts[1]
-        return numbers
+            metrics[f"{kind}/accuracy"] = counts[0] / counts[1]
+        return metrics
 
     def _put(self, message: tuple[MetricValues, int] | None) -> None:
         try:
@@ -133,8 +134,8 @@ def _opened(
         writer = package.Writer(str(folder / "artifacts" / "tensorboard"))
 
         def add(numbers: MetricValues, step: int) -> None:
-            for each, value in numbers.items():
-                writer.add_scalar(each, value, step)
+            for metric, value in numbers.items():
+                writer.add_scalar(metric, value, step)
 
         return add, writer.close
     run = package.init(

@@ -627,13 +627,14 @@ def _make_absolute(name: str) -> str:
     paths = split_paths(name)
     if len(paths) > 1:
         return "+".join(map(_make_absolute, paths))
-    if os.path.isfile(name):
-        path, mark, part = name, "", ""
-    else:
+    path = name
+    suffix = ""
+    if not os.path.isfile(name):
         path, mark, part = name.partition("#")
+        suffix = f"{mark}{part}"
     looks_like_path = "/" in path or Path(path).suffix != ""
     if looks_like_path and os.path.isfile(path):
-        return f"{Path(path).resolve()}{mark}{part}"
+        return f"{Path(path).resolve()}{suffix}"
     return name
 
 

@@ -163,7 +163,8 @@ def parse_controls(texts: Iterable[str], where: str) -> dict[str, object]:
             if "=" in entry:
                 name, settings = parse_assignment(entry, where)
             else:
-                name, settings = entry.strip(), {}
+                name = entry.strip()
+                settings = {}
             if isinstance(settings, str) and settings.startswith("{"):
                 raise InputError(
                     f"{where}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}} for "

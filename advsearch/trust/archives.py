@@ -251,9 +251,9 @@ class _Inert:
         """Make one as `__reduce__` or as ``cls.__new__`` would; there is no
         `__init__`.
         """
-        made = super().__new__(cls)
-        made.parts = list(parts)
-        return made
+        instance = super().__new__(cls)
+        instance.parts = list(parts)
+        return instance
 
     def __setstate__(self, state: Any) -> None:
         self.parts.append(state)
@@ -317,7 +317,7 @@ def _check_pickle(archive: Archive, name: str) -> None:
 
 def _check_values(archive: Archive, name: str, value: Any) -> None:
     level = [value]
-    seen = {id(value)}
+    checked_ids = {id(value)}
     for _ in range(DEPTH):
         signs = {sign for item in level if isinstance(item, str) for sign in item}
         if any(ord(sign) not in _WHITE and not sign.isprintable() for sign in signs):
@@ -330,9 +330,11 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
                 inside = chain(outer, outer.values())
             elif isinstance(outer, (list, tuple, _Inert)):
                 inside = outer.parts if isinstance(outer, _Inert) else outer
-            new |= {id(inner): inner for inner in inside if id(inner) not in seen}
+            new |= {
+                id(inner): inner for inner in inside if id(inner) not in checked_ids
+            }
         level = list(new.values())
-        seen.update(new)
+        checked_ids.update(new)
         if not level:
             return
     raise refused(archive.path, f"{name!r} is nested deeper than {DEPTH}")

@@ -102,13 +102,13 @@ def names_code(function: Function) -> Function:
     signature = inspect.signature(function)
 
     @wraps(function)
-    def asked(*args: Any, **given: Any) -> Any:
+    def wrapper(*args: Any, **keywords: Any) -> Any:
         # of arguments that do not fit, which the function says itself
         with suppress(TypeError):
-            allow_named(signature.bind(*args, **given).arguments)
-        return function(*args, **given)
+            allow_named(signature.bind(*args, **keywords).arguments)
+        return function(*args, **keywords)
 
-    return asked  # type: ignore[return-value]
+    return wrapper  # type: ignore[return-value]
 
 
 def _listed(value: Any) -> list[Any]:

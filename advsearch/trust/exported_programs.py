@@ -206,7 +206,10 @@ OLD_NAMES = {
 
 EXAMPLE = ("data/sample_inputs/model.pt", "serialized_example_inputs.pt")
 
-NAMESPACES = "aten|prims|quantized|_quantized|quantized_decomposed|mkldnn|onednn|torchvision|torchao"
+NAMESPACES = (
+    "aten|prims|quantized|_quantized|quantized_decomposed|mkldnn|onednn|torchvision|"
+    "torchao"
+)
 HARMFUL = frozenset(
     [
         "save",
@@ -221,7 +224,10 @@ HARMFUL = frozenset(
 )
 """Operators of these namespaces that touch files, the terminal or the process."""
 
-HIGHER_ORDER = "cond|map_impl|scan|associative_scan|flex_attention|wrap_with_set_grad_enabled|wrap_with_autocast"
+HIGHER_ORDER = (
+    "cond|map_impl|scan|associative_scan|flex_attention|wrap_with_set_grad_enabled|"
+    "wrap_with_autocast"
+)
 
 _OPERATOR = re.compile(
     rf"torch\.ops\.(?:{NAMESPACES})\.(\w+)\.\w+|torch\.ops\.higher_order\.(?:{HIGHER_ORDER})"
@@ -343,7 +349,7 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
 
 
 # ---- the description of the network
-# ----------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 
 
 def _checked(path: Path, value: JsonValue, key: str) -> Any:
@@ -465,7 +471,7 @@ _TEXTS: dict[str, Callable[[str], str]] = {
 
 
 # ---- pickles of tensors
-# ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 
 
 def _check_pickle(archive: Archive, name: str) -> None:

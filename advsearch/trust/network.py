@@ -171,7 +171,7 @@ def https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
         data = ssl.PEM_cert_to_DER_cert(certificate.read_text(encoding="ascii"))
     digest = hashlib.sha256(data).hexdigest().upper()
     return context, ":".join(
-        digest[place : place + 2] for place in range(0, len(digest), 2)
+        digest[index : index + 2] for index in range(0, len(digest), 2)
     )
 
 

@@ -85,12 +85,16 @@ def check_request(
         if headers.get("Sec-Fetch-Mode") != "navigate" or command == "POST":
             raise Refused(HTTPStatus.FORBIDDEN, "a page of another site asks")
     if token is not None:
-        given = parse_qs(urlsplit(path).query).get("token", [])
+        tokens = parse_qs(urlsplit(path).query).get("token", [])
         for part in headers.get("Cookie", "").split(";"):
             name, _, value = part.strip().partition("=")
             if name == f"{COOKIE}-{port}":
-                given.append(value)
-        if not any(hmac.compare_digest(token, one) for one in given if one.isascii()):
+                tokens.append(value)
+        if not any(
+            hmac.compare_digest(token, candidate)
+            for candidate in tokens
+            if candidate.isascii()
+        ):
             raise Refused(
                 HTTPStatus.UNAUTHORIZED,
                 "the token is missing; open the address that was printed",
@@ -101,8 +105,8 @@ def _is_own(host: str, named: str, port: int, token: str | None) -> bool:
     """Whether a request's Host is an address of this server: a name would need a name
     server to lead here.
     """
-    name, _, own_port = host.rpartition(":")
-    if not own_port.isdecimal() or int(own_port) != port:
+    name, _, port_text = host.rpartition(":")
+    if not port_text.isdecimal() or int(port_text) != port:
         return False
     if token is None:
         return name in ("localhost", LOOPBACK, "[::1]")
@@ -128,7 +132,7 @@ def page_policy(digests: Iterable[str], *, connects: bool) -> str:
     images, connect = (
         ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
     )
-    runs = "".join(f" 'sha256-{one}'" for one in sorted(digests))
+    runs = "".join(f" 'sha256-{digest}'" for digest in sorted(digests))
     scripts = f"; script-src{runs}" if runs else ""
     return (
         f"default-src 'none'; img-src {images}; style-src "

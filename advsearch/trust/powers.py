@@ -34,11 +34,11 @@ def many_processes(count: int | None) -> str:
     """Of a number of processes; as many as there are processors are no more than a run
     takes anyway.
     """
-    here = cores()
+    n_processors = cores()
     return (
         ""
-        if count is None or count <= here
-        else (f"starts {count} processes on {here} processors")
+        if count is None or count <= n_processors
+        else (f"starts {count} processes on {n_processors} processors")
     )
 
 
@@ -93,12 +93,12 @@ class LeftOut(NamedTuple):
         """How a person asks for it, and how to do without, as both are typed behind a
         file or a run.
         """
-        plain, without = (
+        value_text, default_text = (
             str(v).lower() if isinstance(v, bool) else v
             for v in (self.value, self.default)
         )
-        asked = shlex.quote(f"{self.name}={plain}")
+        assignment = shlex.quote(f"{self.name}={value_text}")
         return (
-            f"{asked} if you want that, or "
-            f"{self.name}={'null' if without is None else without} to do without"
+            f"{assignment} if you want that, or "
+            f"{self.name}={'null' if default_text is None else default_text} to do without"
         )

@@ -59,12 +59,12 @@ def surroundings(folder: str) -> dict[str, str]:
     """Return the environment of a process that has a folder for its home, and nothing
     of ours but the path.
     """
-    kept = {
+    variables = {
         name: os.environ[name]
         for name in ("PATH", "LD_LIBRARY_PATH")
         if name in os.environ
     }
-    return {**kept, "HOME": folder, "TMPDIR": folder}
+    return {**variables, "HOME": folder, "TMPDIR": folder}
 
 
 BLENDER = "ADVSEARCH_BLENDER"

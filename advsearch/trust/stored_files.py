@@ -16,7 +16,7 @@ import json
 import math
 import os
 import stat
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -58,8 +58,8 @@ def reading(path: Path | str) -> Iterator[None]:
 
 def note_opened(path: Path | str) -> None:
     """Remember that a file was read; `open_regular` does it itself."""
-    own = os.path.abspath(path)
-    _OPENED.setdefault(_ROOT.get() or own, {})[own] = None
+    absolute_path = os.path.abspath(path)
+    _OPENED.setdefault(_ROOT.get() or absolute_path, {})[absolute_path] = None
 
 
 def opened_for(path: Path | str) -> list[str]:
@@ -198,15 +198,13 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
 
 
 def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
-    """Return whether lists and mappings are nested at most so deep in `value`."""
-    inner = (
-        value.values()
-        if isinstance(value, Mapping)
-        else value
-        if isinstance(value, (list, tuple))
-        else ()
-    )
-    return levels >= 0 and all(is_shallow(part, levels - 1) for part in inner)
+    """Return whether lists and mappings are nested at most `levels` deep in a value."""
+    children: Iterable[Any] = ()
+    if isinstance(value, Mapping):
+        children = value.values()
+    elif isinstance(value, (list, tuple)):
+        children = value
+    return levels >= 0 and all(is_shallow(child, levels - 1) for child in children)
 
 
 def _whole_number(text: str) -> int:

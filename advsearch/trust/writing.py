@@ -262,11 +262,11 @@ def check_no_links(run: Path, contents: Collection[str], unread: str) -> None:
     while folders:
         folder = folders.pop()
         try:
-            with os.scandir(folder) as found:
+            with os.scandir(folder) as entries:
                 inside = [
-                    one
-                    for one in found
-                    if folder != str(run) or one.name in (*contents, LOCK)
+                    entry
+                    for entry in entries
+                    if folder != str(run) or entry.name in (*contents, LOCK)
                 ]
         except OSError as error:
             if error.errno == errno.ENOENT:  # it was removed meanwhile
@@ -274,17 +274,17 @@ def check_no_links(run: Path, contents: Collection[str], unread: str) -> None:
             raise FileFormatError(
                 f"{folder}: expected a folder of a run, got {error.strerror}"
             ) from None
-        for one in inside:
-            if one.is_symlink():
+        for entry in inside:
+            if entry.is_symlink():
                 raise FileFormatError(
-                    f"{one.path}: expected a file or a folder of "
+                    f"{entry.path}: expected a file or a folder of "
                     "this run, got a link; remove it"
                 )
-            if one.is_dir(follow_symlinks=False):
+            if entry.is_dir(follow_symlinks=False):
                 if not folder.endswith(unread):
-                    folders.append(one.path)
-            elif not one.is_file(follow_symlinks=False) and one.name != LOCK:
+                    folders.append(entry.path)
+            elif not entry.is_file(follow_symlinks=False) and entry.name != LOCK:
                 raise FileFormatError(
-                    f"{one.path}: expected a file of this run, got a "
+                    f"{entry.path}: expected a file of this run, got a "
                     "pipe or the like; remove it"
                 )

@@ -120,20 +120,20 @@ def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
     if depth >= DEPTH or counts.get(id(node), 1) == 0:
         raise _problem(node, f"lists or mappings nested deeper than {DEPTH}")
     if isinstance(node, yaml.MappingNode):
-        seen = set[str]()
+        names = set[str]()
         for name, _ in node.value:
-            if isinstance(name, yaml.ScalarNode) and name.value in seen:
+            if isinstance(name, yaml.ScalarNode) and name.value in names:
                 raise _problem(name, f"the name {name.value[:60]!r} twice")
-            seen.add(str(name.value))
+            names.add(str(name.value))
     if id(node) not in counts:
         counts[id(node)] = 0
-        inner = (
+        children = (
             node.value
             if isinstance(node, yaml.SequenceNode)
             else [part for pair in node.value for part in pair]
         )
         total = 1
-        for part in inner:
+        for part in children:
             total += _check(part, depth + 1, counts)
             if total > MOST_VALUES:
                 raise _problem(node, f"more than {MOST_VALUES:,} values")

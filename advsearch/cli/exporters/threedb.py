@@ -45,11 +45,12 @@ def write_threedb(
     if not classes:
         raise InputError("format 3db: needs the rows of a sweep, and this run has none")
     numbers = {name: number for name, number in classes.items() if number is not None}
-    for name in [one for one in classes if one not in numbers]:  # behind the others
-        numbers[name] = max(numbers.values(), default=-1) + 1
-    called = {number: name for name, number in numbers.items()}
+    for name in classes:  # those without a number come behind the others
+        if name not in numbers:
+            numbers[name] = max(numbers.values(), default=-1) + 1
+    class_by_number = {number: name for name, number in numbers.items()}
     with writing.placed_by("out"):
-        count = 0
+        n_rows = 0
         with (
             writing.replacing(out / DETAILS) as part,
             part.open("w", encoding="utf-8") as file,
@@ -62,20 +63,22 @@ def write_threedb(
                     writing.write_bytes(
                         out / IMAGES / f"{line['id']}_rgb.png", data, durable=False
                     )
-                count += 1
-        listed = [
-            called.get(number, f"class {number}") for number in range(max(called) + 1)
+                n_rows += 1
+        class_names = [
+            class_by_number.get(number, f"class {number}")
+            for number in range(max(class_by_number) + 1)
         ]
-        writing.write_text(out / CLASSES, json.dumps(listed))
-    return count
+        writing.write_text(out / CLASSES, json.dumps(class_names))
+    return n_rows
 
 
 def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]:
-    said = {name: one["value"] for name, one in row.values.items()}
+    value_of = {name: entry["value"] for name, entry in row.values.items()}
     parameters = {
-        "network" if name == "model" else name: said.get(name, "none") for name in names
+        "network" if name == "model" else name: value_of.get(name, "none")
+        for name in names
     }
-    environment, model = (str(said.get(name, "none")) for name in PLACED)
+    environment, model = (str(value_of.get(name, "none")) for name in PLACED)
     return {
         "id": f"{row.step}",
         "environment": environment,
@@ -102,13 +105,13 @@ class ThreeDB(Exporter):
         from advsearch.extend import exports  # takes seconds
 
         run_path = directory.find_run(run)
-        kept = exports.thumbnails.find_thumbnails(run_path)
+        thumbnails = exports.thumbnails.find_thumbnails(run_path)
         with Store(run_path / Store.FILE, read_only=True) as store:
-            picture = kept.read_png if kept else lambda _: None
-            count = write_threedb(
-                lambda: store.rows(options["kind"] or "sweep"), out, picture
+            read_picture = thumbnails.read_png if thumbnails else lambda _: None
+            n_rows = write_threedb(
+                lambda: store.rows(options["kind"] or "sweep"), out, read_picture
             )
         return Exported(
-            {"rows": count},
-            f"{count} rows in {out}; look at them with: python -m threedboard {out}",
+            {"rows": n_rows},
+            f"{n_rows} rows in {out}; look at them with: python -m threedboard {out}",
         )

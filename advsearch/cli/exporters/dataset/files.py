@@ -43,18 +43,18 @@ class Categories:
     unnamed: set[str] = field(default_factory=set)
 
     def find_things(self, image: Any) -> list[tuple[Any, int]]:
-        """Return the things that an image shows, each with the number of its
+        """Return the things that an image shows, each with the index of its
         category.
         """
-        own = image.task
+        task = image.task
         facts = image.facts
-        if isinstance(own, tasks.EnsembleTask):
-            own = own.tasks[0]
+        if isinstance(task, tasks.EnsembleTask):
+            task = task.tasks[0]
         labels: tuple[str, ...] = (facts.label or facts.object_label or facts.object,)
-        right = 0
-        if isinstance(own, tasks.ClassTask) and own.labels:
-            labels = own.labels
-            right = own.find_right_classes(facts)[0]
+        object_category = 0
+        if isinstance(task, tasks.ClassTask) and task.labels:
+            labels = task.labels
+            object_category = task.find_right_classes(facts)[0]
         if self.labels not in ((), labels):
             raise InputError(
                 f"RUN: its parts have other categories, {facts.object} among them; "
@@ -64,14 +64,10 @@ class Categories:
         things = []
         for thing in image.list_things():
             try:
-                is_object = thing.name == "object"
-                category = (
-                    right
-                    if is_object
-                    else models.find_label_set(image.get_label(thing), labels).indices[
-                        0
-                    ]
-                )
+                category = object_category
+                if thing.name != "object":
+                    label_set = models.find_label_set(image.get_label(thing), labels)
+                    category = label_set.indices[0]
                 things.append((thing, category))
             except InputError:
                 self.unnamed.add(thing.name)
@@ -81,13 +77,24 @@ class Categories:
 def write_dataset(
     run: str, out: Path, format: str, *, every: bool, progress: Progress
 ) -> tuple[int, list[str]]:
-    """Write the pictures of a run of `sweep` or `attack`, or of one with such parts (a
-    suite, a study), with what is true of them, whole or not at all, to a folder that is
-    made, or empty; as "coco" or "yolo", and `every` one or only those that not all
-    models are right about. Returns how many there are (of 0, nothing is written), and
-    sentences that a reader has to know. Raises InputError where the scene of the run is
-    not to be had any more, or `out` is not empty, and FileFormatError where the run is
-    of another command, or has not ended.
+    """Write the pictures of a run as a dataset, with what is true of them.
+
+    It is written whole or not at all; nothing is written of no pictures.
+
+    Args:
+        run: of `sweep` or `attack`, or with such parts (a suite, a study).
+        out: the folder, which is made, or empty.
+        format: "coco" or "yolo".
+        every: whether also pictures that all models are right about are written.
+        progress: is told how far it is.
+
+    Returns:
+        How many pictures there are, and sentences that a reader has to know.
+
+    Raises:
+        InputError: the scene of the run is not to be had any more, or `out` is not
+            empty.
+        FileFormatError: the run is of another command, or has not ended.
     """
     writing.check_free_folder(out, "out")
     directory.find_run(run)  # refuses before anything is written
@@ -95,108 +102,141 @@ def write_dataset(
     with writing.placed_by("out"):
         with writing.storage_errors(out):
             out.parent.mkdir(parents=True, exist_ok=True)
-            kept = tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent)
-        with kept:
-            place = Path(kept.name) / "dataset"
+            temporary = tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent)
+        with temporary:
+            folder = Path(temporary.name) / "dataset"
             images = list[dict[str, Any]]()
-            things = list[dict[str, Any]]()
-            others = 0
-            for number, shown in enumerate(
-                exports.render_rows(run, every=every, progress=progress), 1
-            ):
-                seen = categories.find_things(shown)
-                Exporter.write_png(
-                    place / IMAGES / f"{shown.name}.png", shown.picture.numpy()
-                )
-                images.append(make_image(number, shown))
-                things += [
-                    make_thing(len(things) + k, number, *one)
-                    for k, one in enumerate(seen, 1)
-                ]
-                others += not shown.is_reproduced
-                # the class, the middle of the box and its size, as shares of the
-                # picture
+            annotations = list[dict[str, Any]]()
+            n_changed = 0
+            rendered = exports.render_rows(run, every=every, progress=progress)
+            for image_id, image in enumerate(rendered, 1):
+                things = categories.find_things(image)
+                path = folder / IMAGES / f"{image.name}.png"
+                Exporter.write_png(path, image.picture.numpy())
+                images.append(make_image(image_id, image))
+                annotations += make_things(len(annotations) + 1, image_id, things)
+                n_changed += not image.is_reproduced
                 if format == "yolo":
-                    (height, width) = shown.picture.shape[:2]
-                    text = ""
-                    for thing, category in seen:
-                        x, y, across, down = find_box(thing)
-                        box = (
-                            (x + across / 2) / width,
-                            (y + down / 2) / height,
-                            across / width,
-                            down / height,
-                        )
-                        text += (
-                            f"{category} "
-                            + " ".join(f"{side:.6f}" for side in box)
-                            + "\n"
-                        )
-                    writing.write_text(place / LABELS / f"{shown.name}.txt", text)
+                    labels = make_yolo_labels(image, things)
+                    writing.write_text(folder / LABELS / f"{image.name}.txt", labels)
             if not images:
                 return 0, []
             if format == "yolo":
-                names: dict[str, Any] = {
-                    "train": IMAGES,
-                    "val": IMAGES,
-                    "names": [*categories.labels],
-                }
-                writing.write_text(place / YOLO, json.dumps(names, indent=1) + "\n")
+                write_yolo_index(folder, categories)
             else:
-                # labels that name nothing, such as a background, are no categories, and
-                # the others keep their numbers
-                named = [
-                    (number, name)
-                    for number, name in enumerate(categories.labels)
-                    if not models.is_nothing_name(name)
-                ]
-                dataset: dict[str, Any] = {
-                    "info": {
-                        "description": "pictures of advsearch",
-                        "version": advsearch.__version__,
-                    },
-                    "licenses": [],
-                    "images": [*images],
-                    "annotations": [*things],
-                    "categories": [
-                        {"id": number, "name": name, "supercategory": ""}
-                        for number, name in named
-                    ],
-                }
-                writing.write_text(place / COCO, json.dumps(dataset, allow_nan=False))
+                write_coco_index(folder, categories, images, annotations)
             with writing.storage_errors(out):
-                os.replace(place, out)
+                os.replace(folder, out)
+    return len(images), make_notes(categories, n_changed)
+
+
+def make_yolo_labels(image: Any, things: list[tuple[Any, int]]) -> str:
+    """Return a line for each thing: its class, and center and size of its box as
+    fractions of the picture.
+    """
+    (image_height, image_width) = image.picture.shape[:2]
+    lines = []
+    for thing, category in things:
+        x, y, width, height = find_box(thing)
+        box = (
+            (x + width / 2) / image_width,
+            (y + height / 2) / image_height,
+            width / image_width,
+            height / image_height,
+        )
+        numbers = " ".join(f"{value:.6f}" for value in box)
+        lines.append(f"{category} {numbers}\n")
+    return "".join(lines)
+
+
+def write_yolo_index(folder: Path, categories: Categories) -> None:
+    """Write the YAML that names the folders and classes of a YOLO dataset."""
+    index: dict[str, Any] = {
+        "train": IMAGES,
+        "val": IMAGES,
+        "names": [*categories.labels],
+    }
+    writing.write_text(folder / YOLO, json.dumps(index, indent=1) + "\n")
+
+
+def write_coco_index(
+    folder: Path,
+    categories: Categories,
+    images: list[dict[str, Any]],
+    annotations: list[dict[str, Any]],
+) -> None:
+    """Write the JSON of a COCO dataset.
+
+    Labels that name nothing, such as a background, are no categories, and the others
+    keep their numbers.
+    """
+    category_entries = [
+        {"id": index, "name": name, "supercategory": ""}
+        for index, name in enumerate(categories.labels)
+        if not models.is_nothing_name(name)
+    ]
+    dataset: dict[str, Any] = {
+        "info": {
+            "description": "pictures of advsearch",
+            "version": advsearch.__version__,
+        },
+        "licenses": [],
+        "images": images,
+        "annotations": annotations,
+        "categories": category_entries,
+    }
+    writing.write_text(folder / COCO, json.dumps(dataset, allow_nan=False))
+
+
+def make_notes(categories: Categories, n_changed: int) -> list[str]:
+    """Return sentences about things without a category, and about pictures that the
+    model now judges otherwise.
+    """
     notes = []
     if categories.unnamed:
         notes.append(
             "Without a category, as no label is called so: "
             f"{', '.join(sorted(categories.unnamed))}."
         )
-    if others:
+    if n_changed:
         notes.append(
-            f"In {others} of them the model says otherwise than the run's "
+            f"In {n_changed} of them the model says otherwise than the run's "
             "rows: something has changed since."
         )
-    return len(images), notes
+    return notes
 
 
-def make_image(number: int, shown: Any) -> dict[str, Any]:
-    height, width = shown.picture.shape[:2]
+def make_image(image_id: int, image: Any) -> dict[str, Any]:
+    """Return the entry of a picture in COCO's JSON, with its predictions and values."""
+    height, width = image.picture.shape[:2]
     predictions: list[dict[str, Any]] = [
         {
-            "row": row.id, "kind": row.kind, "step": row.step, "right": row.correct, "label": row.label,
-            "probability": row.probability, "margin": row.margin,
-            **{name: one["value"] for name, one in row.values.items() if name == "model"},
+            "row": row.id,
+            "kind": row.kind,
+            "step": row.step,
+            "right": row.correct,
+            "label": row.label,
+            "probability": row.probability,
+            "margin": row.margin,
+            **{
+                name: entry["value"]
+                for name, entry in row.values.items()
+                if name == "model"
+            },
         }
-        for row in shown.rows
-    ]  # fmt: skip
+        for row in image.rows
+    ]
+    configuration = {
+        name: dict(entry) for name, entry in image.values.items() if name != "model"
+    }
     extras: dict[str, Any] = {
-        "right": all(row.correct for row in shown.rows), "answers": predictions,
-        "configuration": {name: dict(one) for name, one in shown.values.items() if name != "model"},
-    }  # fmt: skip
+        "right": all(row.correct for row in image.rows),
+        "answers": predictions,
+        "configuration": configuration,
+    }
     return {
-        "id": number,
-        "file_name": f"{shown.name}.png",
+        "id": image_id,
+        "file_name": f"{image.name}.png",
         "height": height,
         "width": width,
         "advsearch": extras,
@@ -209,7 +249,19 @@ def find_box(thing: Any) -> tuple[float, float, float, float]:
     return left, top, right - left, bottom - top
 
 
+def make_things(
+    first_id: int, image_id: int, things: list[tuple[Any, int]]
+) -> list[dict[str, Any]]:
+    """Return the annotations of the things in a picture, with ids from `first_id` on."""
+    return [
+        make_thing(first_id + index, image_id, thing, category)
+        for index, (thing, category) in enumerate(things)
+    ]
+
+
 def make_thing(number: int, image: int, thing: Any, category: int) -> dict[str, Any]:
+    """Return the annotation of a thing in COCO's JSON, with its mask as runs."""
+    fraction = thing.visible_fraction
     return {
         "id": number,
         "image_id": image,
@@ -221,8 +273,8 @@ def make_thing(number: int, image: int, thing: Any, category: int) -> dict[str, 
             "counts": [*find_runs(thing.mask)],
         },
         "iscrowd": 0,
-        "visible_share": None if thing.share is None else round(thing.share, 4),
-        "truncated": thing.truncated,
+        "visible_share": None if fraction is None else round(fraction, 4),
+        "truncated": thing.is_truncated,
         "name": thing.name,
         "distance": round(thing.distance, 4),
     }

@@ -4,6 +4,7 @@ and what to set.
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from pathlib import Path
@@ -31,18 +32,25 @@ SPP = 64  # samples a pixel of the picture of the scene with the marks
 
 
 def write_projection(run: str | Path, out: Path) -> list[str]:
-    """Write a folder for each projector of a run's adversarial scene: `picture.png` to
-    project, `texels.png` with the exact values, `marks.png` to project first,
-    `seen.png`, where the run's camera sees these marks, and `README.txt`; return
-    sentences about what to set. Raises errors as `AdversarialRun.load`, and InputError
-    where it has no projector, or the folder is there already.
+    """Write a folder for each projector of a run's adversarial scene.
+
+    It has `picture.png` to project, `texels.png` with the exact values, `marks.png` to
+    project first, `seen.png`, where the run's camera sees these marks, and
+    `README.txt`.
+
+    Returns:
+        Sentences about what to set.
+
+    Raises:
+        InputError: it has no projector, or the folder is there already; other errors
+            as for `AdversarialRun.load`.
     """
     if os.path.lexists(out):
         raise InputError(f"out: {out} is there already; choose another name")
     adversarial = exports.AdversarialRun.load(run)
     slices = adversarial.problem.space.split_by_control(adversarial.u)
     projectors: list[tuple[Any, Tensor]] = [
-        (control, part) for control, part in slices if has_pattern(control)
+        (control, u) for control, u in slices if has_pattern(control)
     ]
     if not projectors:
         raise InputError(
@@ -51,68 +59,81 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
         )
     notes: list[str] = []
     with writing.placed_by("out"), writing.storage_errors(out):
-        for control, part in projectors:
+        for control, u in projectors:
             folder = out / control.file_name if len(projectors) > 1 else out
             folder.mkdir(parents=True)
-            values = control.values(part)
-            pattern = values["pattern"]
-            factor = -(-ROWS // len(pattern))
-            marks, places = marked((len(pattern), pattern.shape[1]), factor)
-            small = torch.nn.functional.avg_pool2d(
-                marks.permute(2, 0, 1)[None], factor
-            )[0].permute(1, 2, 0)
-            Exporter.write_png(folder / "picture.png", images.enlarge(pattern, factor))
-            Exporter.write_png(folder / "texels.png", pattern)
-            Exporter.write_png(folder / "marks.png", color.linear_to_srgb(marks))
-            lit = control.scene_inputs(
-                {**values, "pattern": color.linear_to_srgb(small)}, {}
-            )
-            seed = seeds.stream(adversarial.problem.seed, "marks")
-            Exporter.write_png(
-                folder / "seen.png",
-                adversarial.render({**adversarial.inputs, **lit}, seed, SPP),
-            )
-            number = {
-                name: float(value) for name, value in values.items() if value.ndim == 0
-            }
-            unit = "m" if control.scene.object.metres is not None else "object sizes"
-            fov = control.part.fov
-            aspect = control.part.aspect
-            white = control.measured(values, {})["white"]["value"]
-            half = math.tan(math.radians(fov) / 2.0)
-            settings = [
-                f"{number['lumens']:g} lumens for a white picture, "
-                f"{number['distance']:.3g} {unit} from the object's "
-                "middle",
-                f"a picture {fov:.3g} degrees wide (throw ratio {0.5 / half:.2f}), "
-                f"{aspect:.3g} times as wide as high",
-                f"azimuth {number['azimuth'] % 360.0:.4g} and elevation "
-                f"{number['elevation']:.4g} degrees around the "
-                "object",
-                f"ambient light of {number['ambient']:.4g} lux; white is {white:.4g} "
-                "lux on the object",
-            ]
-            where = []
-            for mark, (row, column, x, y) in enumerate(places, 1):
-                right, up = (
-                    math.degrees(math.atan(at))
-                    for at in ((2 * x - 1) * half, (1 - 2 * y) * half / aspect)
-                )
-                at = f"{mark}: row {row}, column {column}"
-                where.append(
-                    f"{at}; {right:.2f} degrees to the right of the middle, {up:.2f} up"
-                )
-            text = [
-                "Set:",
-                *settings,
-                "",
-                "Marks of marks.png, by texel from the upper left:",
-                *where,
-                "",
-            ]
-            writing.write_text(folder / "README.txt", "\n".join(text), durable=False)
-            notes += settings
+            notes += write_projector(folder, adversarial, control, control.values(u))
     return notes
+
+
+def write_projector(
+    folder: Path, adversarial: Any, control: Any, values: dict[str, Tensor]
+) -> list[str]:
+    """Write the files of one projector, and return sentences about what to set."""
+    pattern = values["pattern"]
+    n_rows, n_columns = pattern.shape[:2]
+    factor = -(-ROWS // n_rows)
+    marks, marked_texels = make_marks((n_rows, n_columns), factor)
+    texel_marks = torch.nn.functional.avg_pool2d(marks.permute(2, 0, 1)[None], factor)[
+        0
+    ].permute(1, 2, 0)
+    Exporter.write_png(folder / "picture.png", images.enlarge(pattern, factor))
+    Exporter.write_png(folder / "texels.png", pattern)
+    Exporter.write_png(folder / "marks.png", color.linear_to_srgb(marks))
+    lit_inputs = control.scene_inputs(
+        {**values, "pattern": color.linear_to_srgb(texel_marks)}, {}
+    )
+    seed = seeds.stream(adversarial.problem.seed, "marks")
+    view = adversarial.render({**adversarial.inputs, **lit_inputs}, seed, SPP)
+    Exporter.write_png(folder / "seen.png", view)
+    settings = describe_settings(control, values)
+    text = [
+        "Set:",
+        *settings,
+        "",
+        "Marks of marks.png, by texel from the upper left:",
+        *describe_marks(control, marked_texels),
+        "",
+    ]
+    writing.write_text(folder / "README.txt", "\n".join(text), durable=False)
+    return settings
+
+
+def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
+    """Return what to set at a projector and around it, a sentence each."""
+    number = {name: float(value) for name, value in values.items() if value.ndim == 0}
+    unit = "m" if control.scene.object.metres is not None else "object sizes"
+    fov = control.part.fov
+    white = control.measured(values, {})["white"]["value"]
+    half_width = math.tan(math.radians(fov) / 2.0)
+    return [
+        f"{number['lumens']:g} lumens for a white picture, "
+        f"{number['distance']:.3g} {unit} from the object's "
+        "middle",
+        f"a picture {fov:.3g} degrees wide (throw ratio {0.5 / half_width:.2f}), "
+        f"{control.part.aspect:.3g} times as wide as high",
+        f"azimuth {number['azimuth'] % 360.0:.4g} and elevation "
+        f"{number['elevation']:.4g} degrees around the "
+        "object",
+        f"ambient light of {number['ambient']:.4g} lux; white is {white:.4g} "
+        "lux on the object",
+    ]
+
+
+def describe_marks(
+    control: Any, marked_texels: list[tuple[int, int, float, float]]
+) -> list[str]:
+    """Return texel and direction of each mark, a line each."""
+    half_width = math.tan(math.radians(control.part.fov) / 2.0)
+    lines = []
+    for index, (row, column, x, y) in enumerate(marked_texels, 1):
+        right = math.degrees(math.atan((2 * x - 1) * half_width))
+        up = math.degrees(math.atan((1 - 2 * y) * half_width / control.part.aspect))
+        lines.append(
+            f"{index}: row {row}, column {column}; {right:.2f} degrees to the right of "
+            f"the middle, {up:.2f} up"
+        )
+    return lines
 
 
 def has_pattern(control: Control) -> bool:
@@ -124,35 +145,50 @@ def has_pattern(control: Control) -> bool:
     )
 
 
-def marked(
-    sides: tuple[int, int], factor: int
+def make_marks(
+    shape: tuple[int, int], factor: int
 ) -> tuple[Tensor, list[tuple[int, int, float, float]]]:
-    """Return a picture of a frame and nine numbered crosses on black, (h, w, 3) linear
-    in [0, 1], so many times as large as a pattern of `sides` rows and columns, and of
-    each cross row and column of its texel and their middle as shares of the picture's
-    width and height.
+    """Return a picture of a frame and nine numbered crosses, and where these are.
+
+    Args:
+        shape: rows and columns of the projector's pattern.
+        factor: width of a texel of it in pixels of the picture.
+
+    Returns:
+        The picture on black, (h, w, 3) linear in [0, 1]; and of each cross row and
+        column of its texel, and the texel's center as fractions of width and height.
     """
-    height = sides[0] * factor
-    width = sides[1] * factor
+    n_rows, n_columns = shape
+    width = n_columns * factor
+    height = n_rows * factor
     picture = Image.new("L", (width, height))
     draw = ImageDraw.Draw(picture)
     line = max(2, height // 200)
-    arm = height // 24
     draw.rectangle((0, 0, width - 1, height - 1), outline=255, width=2 * line)
-    places = []
-    for down in SHARES:
-        for across in SHARES:
-            row = int(down * sides[0])
-            column = int(across * sides[1])
-            x = (column + 0.5) * factor
-            y = (row + 0.5) * factor
-            draw.line((x - arm, y, x + arm, y), fill=255, width=line)
-            draw.line((x, y - arm, x, y + arm), fill=255, width=line)
-            places.append(
-                (row, column, (column + 0.5) / sides[1], (row + 0.5) / sides[0])
-            )
-            draw.text((x + line, y + line), str(len(places)), fill=255, font_size=arm)
+    marked_texels = []
+    for down, across in itertools.product(SHARES, SHARES):
+        row = int(down * n_rows)
+        column = int(across * n_columns)
+        marked_texels.append(
+            (row, column, (column + 0.5) / n_columns, (row + 0.5) / n_rows)
+        )
+        center = (column + 0.5) * factor, (row + 0.5) * factor
+        draw_cross(draw, center, height // 24, line, str(len(marked_texels)))
     levels = torch.frombuffer(bytearray(picture.tobytes()), dtype=torch.uint8).reshape(
         height, width, 1
     )
-    return levels.expand(-1, -1, 3) / 255.0, places
+    return levels.expand(-1, -1, 3) / 255.0, marked_texels
+
+
+def draw_cross(
+    draw: ImageDraw.ImageDraw,
+    center: tuple[float, float],
+    arm: int,
+    line: int,
+    text: str,
+) -> None:
+    """Draw a white cross with its number; lengths are in pixels."""
+    x, y = center
+    draw.line((x - arm, y, x + arm, y), fill=255, width=line)
+    draw.line((x, y - arm, x, y + arm), fill=255, width=line)
+    draw.text((x + line, y + line), text, fill=255, font_size=arm)

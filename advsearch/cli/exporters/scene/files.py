@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,29 +20,29 @@ XML = ".xml"
 
 
 def write_mitsuba(run: str | Path, out: Path) -> list[str]:
-    """Write the adversarial scene of a run as XML with its meshes and pictures beside
-    it, whose names begin with its own, to a file that ends in .xml, or a folder for
-    `scene.xml`; return sentences about how its picture becomes that of the run, and
-    what is no part of it. Raises errors as `AdversarialRun.load`, and InputError where
-    such files are there, or stock Mitsuba has no such scene.
+    """Write the adversarial scene of a run as XML with its meshes and pictures.
+
+    These stand beside it, and their names begin with its own.
+
+    Args:
+        run: a name or a folder.
+        out: a file that ends in .xml, or a folder for `scene.xml`.
+
+    Returns:
+        Sentences about how its picture becomes that of the run, and what is no part of
+        it.
+
+    Raises:
+        InputError: such files are there, or stock Mitsuba has no such scene; other
+            errors as for `AdversarialRun.load`.
     """
     path = out if out.suffix.lower() == XML else out / mitsuba_data.SCENE_FILE_NAME
-    taken = [path, *path.parent.glob(f"{path.stem}-*")] if path.parent.is_dir() else []
-    there = [file for file in taken if os.path.lexists(file)]
-    if there or path.parent.is_file() or os.path.islink(out):
-        raise InputError(
-            f"out: {(there or [path.parent])[0]} is there already; choose another name"
-        )
+    check_free(path, out)
     adversarial = exports.AdversarialRun.load(run)
     renderer = adversarial.problem.renderer
     inputs, on_picture = adversarial.split_inputs()
     backdrop = on_picture.get("backdrop.color")
-    hazes = (
-        part.name
-        for part in renderer.scene.definition[0].parts
-        if isinstance(part, parts.HazePart)
-    )
-    hazy = any(float(inputs[f"{name}.density"]) > 0.0 for name in hazes)
+    hazy = has_haze(renderer, inputs)
     if hazy and backdrop is not None:
         raise InputError(
             f"{adversarial.folder}: haze before a plain background is no "
@@ -49,6 +51,62 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     gain = renderer.formation.gain
     if "camera.exposure" in on_picture:
         gain *= float(torch.exp2(on_picture["camera.exposure"]))
+    notes = [
+        *describe_formation(renderer, gain, backdrop),
+        *describe_omissions(adversarial, hazy=hazy),
+    ]
+    with writing.placed_by("out"), writing.storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as folder:
+            mitsuba_data.write_scene(
+                renderer.scene,
+                inputs,
+                Path(folder) / path.name,
+                " ".join(notes),
+                hide_environment=backdrop is not None,
+            )
+            for file in sorted(Path(folder).iterdir()):
+                os.replace(file, path.parent / file.name)
+        title = (
+            f"The adversarial scene of {adversarial.folder.name} as a scene for "
+            "Mitsuba 3"
+        )
+        text = [f"{title} (advsearch {advsearch.__version__}).\n", *notes, ""]
+        writing.write_text(
+            path.with_name(f"{path.stem}-README.txt"), "\n".join(text), durable=False
+        )
+    return notes
+
+
+def check_free(path: Path, out: Path) -> None:
+    """Check that no file of the scene at `path` exists, and that `out` is no link.
+
+    Raises:
+        InputError: there is one already.
+    """
+    candidates = [path]
+    if path.parent.is_dir():
+        candidates += path.parent.glob(f"{path.stem}-*")
+    existing = [file for file in candidates if os.path.lexists(file)]
+    if existing or path.parent.is_file() or os.path.islink(out):
+        raise InputError(
+            f"out: {(existing or [path.parent])[0]} is there already; "
+            "choose another name"
+        )
+
+
+def has_haze(renderer: Any, inputs: Mapping[str, Any]) -> bool:
+    """Return whether a scene with these inputs has haze that scatters light."""
+    names = [
+        part.name
+        for part in renderer.scene.definition[0].parts
+        if isinstance(part, parts.HazePart)
+    ]
+    return any(float(inputs[f"{name}.density"]) > 0.0 for name in names)
+
+
+def describe_formation(renderer: Any, gain: float, backdrop: Any) -> list[str]:
+    """Return how the radiance of the scene becomes the run's picture, in sentences."""
     height, width = renderer.formation.resolution
     notes = [
         f"The sensor has {width} x {height} pixels, and light paths have at most "
@@ -57,19 +115,24 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
         "off at 1.",
     ]
     if backdrop is not None:
-        red, green, blue = (
-            f"{one:.9g}" for one in (backdrop / renderer.formation.gain).tolist()
-        )
+        channels = (backdrop / renderer.formation.gain).tolist()
+        red, green, blue = (f"{channel:.9g}" for channel in channels)
         notes.append(
             "Where its alpha is under 1, add 1 - alpha times the plain "
             f"background ({red}, {green}, {blue})."
         )
+    return notes
+
+
+def describe_omissions(adversarial: Any, *, hazy: bool) -> list[str]:
+    """Return what differs between the scene's files and the run, in sentences."""
+    notes = []
     if hazy:
         notes.append(
             "Haze scatters light, which Mitsuba counts as a segment: "
             f"{mitsuba_data.EXTRA_DEPTH} more are for that."
         )
-    if renderer.formation.denoiser != "none":
+    if adversarial.problem.renderer.formation.denoiser != "none":
         notes.append("Not in it: the denoiser. Take many samples a pixel.")
     if adversarial.image_controls:
         notes.append(
@@ -78,26 +141,6 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
         )
     if adversarial.problem.conditions is not None:
         notes.append("What varied by chance in the run is as in the clean scene.")
-    with writing.placed_by("out"), writing.storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as made:
-            mitsuba_data.write_scene(
-                renderer.scene,
-                inputs,
-                Path(made) / path.name,
-                " ".join(notes),
-                hide_environment=backdrop is not None,
-            )
-            for one in sorted(Path(made).iterdir()):
-                os.replace(one, path.parent / one.name)
-        what = (
-            f"The adversarial scene of {adversarial.folder.name} as a scene for "
-            "Mitsuba 3"
-        )
-        text = [f"{what} (advsearch {advsearch.__version__}).\n", *notes, ""]
-        writing.write_text(
-            path.with_name(f"{path.stem}-README.txt"), "\n".join(text), durable=False
-        )
     return notes
 
 
