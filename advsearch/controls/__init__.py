@@ -235,12 +235,16 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
         names = ", ".join(control.name for control in controls)
         example = f"{first.name}:KEY=[0.2, 0.8]"
         if first.parameters:
-            one = next(
-                (one for one in first.instance_parameters if one.search is not None),
+            parameter = next(
+                (
+                    parameter
+                    for parameter in first.instance_parameters
+                    if parameter.search is not None
+                ),
                 first.instance_parameters[0],
             )
-            low, high = one.search or (one.low, one.high)
-            example = f"{first.name}={{{one.name}: [{low:g}, {high:g}]}}"
+            low, high = parameter.search or (parameter.low, parameter.high)
+            example = f"{first.name}={{{parameter.name}: [{low:g}, {high:g}]}}"
         raise InputError(
             f"`controls` {names}: every parameter is fixed, so there is nothing to "
             "search; give one a range, "

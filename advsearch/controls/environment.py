@@ -168,12 +168,12 @@ class EnvironmentControl(Control):
         """
         if parameter.name != "which":
             return super().resolve_parameter(parameter)
-        own_environment = (
+        control_environment = (
             None
             if SCENE_ENVIRONMENT in self.list_allowed_values("which", SCENE_ENVIRONMENT)
             else self._find_scene_environment_name(self.scene)
         )
-        return replace(parameter, default=own_environment or SCENE_ENVIRONMENT)
+        return replace(parameter, default=control_environment or SCENE_ENVIRONMENT)
 
     def setting_name(self, parameter: Parameter) -> str:
         return (
@@ -310,10 +310,10 @@ def rotate_map(radiance: Tensor, degrees: Tensor) -> Tensor:
     shift = torch.remainder(degrees / 360.0, 1.0) * columns
     if not shift.requires_grad and float(shift) == 0.0:
         return radiance
-    whole_columns = int(shift.detach().floor())
-    fraction = shift - whole_columns
-    lower = radiance.roll(-whole_columns, dims=1)
-    upper = radiance.roll(-whole_columns - 1, dims=1)
+    full_columns = int(shift.detach().floor())
+    fraction = shift - full_columns
+    lower = radiance.roll(-full_columns, dims=1)
+    upper = radiance.roll(-full_columns - 1, dims=1)
     return lower + fraction * (upper - lower)
 
 

@@ -126,6 +126,22 @@ class WeldedMesh:
 get_welded_mesh = lru_cache(maxsize=8)(WeldedMesh)  # of a mesh; kept in memory
 
 
+def _compute_landmark_weights(
+    positions: Float64Array, points: Float64Array, width: float, density: Float64Array
+) -> Float64Array:
+    """Return the normalized weights (P, N) of landmarks (N, 3) at positions (P, 3).
+
+    Args:
+        positions: of a mesh.
+        points: the landmarks.
+        width: of the kernel.
+        density: (N,) of the landmarks, which the kernel is divided by.
+    """
+    exponent = -cdist(positions, points, "sqeuclidean") / (2.0 * width**2)
+    weights = np.exp(exponent - exponent.max(axis=1, keepdims=True)) / density
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
 @lru_cache(maxsize=8)
 def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     """Return the smoothest displacement fields of a mesh that are no rigid motion.
@@ -149,11 +165,8 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     combination = _without_rotation(points, functions, mass, energy, count)
 
     # Nystrom extension from the landmarks to all positions
-    exponent = -cdist(welded_mesh.positions, points, "sqeuclidean") / (2.0 * width**2)
-    weights = np.exp(exponent - exponent.max(axis=1, keepdims=True)) / density
-    extended = (weights / weights.sum(axis=1, keepdims=True)) @ (
-        functions / np.maximum(values, 0.05)
-    )
+    weights = _compute_landmark_weights(welded_mesh.positions, points, width, density)
+    extended = weights @ (functions / np.maximum(values, 0.05))
     fields = np.einsum("ps,sck->pck", extended, combination)
     return np.asarray(fields / np.linalg.norm(fields, axis=1).max(axis=0))
 

@@ -264,6 +264,13 @@ class ThingsControl(Control):
             *(_footprint(scene, name, so_far) for name in fixed_things),
         ]
 
+    def _read_numbers(self, name: str, values: Values) -> list[float]:
+        """Return the values of a thing's parameters, without derivatives."""
+        return [
+            float(values[f"{name}.{parameter.name}"].detach())
+            for parameter in self.parameters
+        ]
+
     def _find_stand(
         self,
         name: str,
@@ -284,10 +291,7 @@ class ThingsControl(Control):
             solids: of the place, which it goes towards the object for.
         """
         scene = self.scene
-        x, y, heading, is_absent = (
-            float(values[f"{name}.{parameter.name}"].detach())
-            for parameter in self.parameters
-        )
+        x, y, heading, is_absent = self._read_numbers(name, values)
         foot = _foot(scene.meshes[name])
         requested = foot[:2] + np.array([x, y]) / scene.metres
         outline = _rotate_outline(base.outline - foot[:2], heading)
@@ -298,8 +302,7 @@ class ThingsControl(Control):
             gap = MIN_GAP / scene.metres
             pushed = _find_free_shift(footprint, direction, obstacles, solids, gap)
         position = requested + pushed * direction
-        height_above_ground = foot[2] - scene.get_ground_height(foot[:2])
-        height = height_above_ground + scene.get_ground_height(position)
+        height = _compute_height(scene, foot, position)
         return Stand(position, height, pushed), outline + position
 
 
@@ -353,6 +356,20 @@ def _find_free_shift(
         if begin < shift < end:
             shift = end + gap
     return shift
+
+
+def _compute_height(
+    scene: SceneDescription,
+    foot: assets.Float64Array,
+    position: assets.Float64Array,
+) -> float:
+    """Return the height at a position (2,) of a thing that is as far above the ground there.
+
+    `foot` is the point (3,) that it stands at so far.
+    """
+    height_above_ground = foot[2] - scene.get_ground_height(foot[:2])
+    height: float = height_above_ground + scene.get_ground_height(position)
+    return height
 
 
 def _foot(part: parts.MeshPart) -> assets.Float64Array:

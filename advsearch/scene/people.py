@@ -234,15 +234,8 @@ class Person:
             shoe_points = skin_points(points[shoe], weights[shoe], turns, shifts)
             lowest[side] = shoe_points[:, 2].amin()
             contact[side] = compute_contact(number["walk"] + phase_shift)
-        ground = (contact["l"] * lowest["l"] + contact["r"] * lowest["r"]) / (
-            contact["l"] + contact["r"]
-        )
         amount = (number["stride"] / FULL_CONTACT_STRIDE).clamp(max=1.0)
-        raised = dict[str, Tensor]()
-        for side, height in lowest.items():
-            clearance = (height - ground).clamp(min=0.0) * (1.0 - contact[side])
-            raised[side] = amount * (ground + clearance - height)
-        return raised
+        return _correct_heights(lowest, contact, amount)
 
     def _correct_legs(
         self,
@@ -460,6 +453,26 @@ def skin_points(
     )
 
 
+def _correct_heights(
+    lowest: Mapping[str, Tensor], contact: Mapping[str, Tensor], amount: Tensor
+) -> dict[str, Tensor]:
+    """Return how much each foot has to rise to touch the ground.
+
+    Args:
+        lowest: height of the lowest point of each foot, "l" and "r".
+        contact: of each foot with the ground, 0 to 1.
+        amount: () fraction of the correction that is made.
+    """
+    ground = (contact["l"] * lowest["l"] + contact["r"] * lowest["r"]) / (
+        contact["l"] + contact["r"]
+    )
+    raised = dict[str, Tensor]()
+    for side, height in lowest.items():
+        clearance = (height - ground).clamp(min=0.0) * (1.0 - contact[side])
+        raised[side] = amount * (ground + clearance - height)
+    return raised
+
+
 def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return each bone's turn (3, 3) against its parent, of joint angles in degrees."""
     # The back bends in three equal parts, neck and head share the nod.
@@ -481,20 +494,35 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
         "neck_01": nod,
         "head": nod,
     }
-    for side_name, sign in (("left", 1.0), ("right", -1.0)):
-        limb = {joint: angle[f"{side_name}_{joint}"] for joint, *_ in LIMBS}
-        suffix = side_name[0]
-        raised = rotation_about("x", sign * limb["shoulder_out"]) @ rotation_about(
-            "y", -limb["shoulder"]
-        )
-        shoulder_turn = rotation_about("z", -sign * limb["shoulder_turn"])
-        turns[f"upperarm_{suffix}"] = raised @ shoulder_turn
-        turns[f"lowerarm_{suffix}"] = rotation_about("y", -limb["elbow"])
-        turns[f"thigh_{suffix}"] = rotation_about(
-            "x", sign * limb["hip_out"]
-        ) @ rotation_about("y", -limb["hip"])
-        turns[f"calf_{suffix}"] = rotation_about("y", limb["knee"])
-        turns[f"foot_{suffix}"] = rotation_about("y", -limb["ankle"])
+    turns |= _compute_limb_turns(angle, "left", 1.0)
+    turns |= _compute_limb_turns(angle, "right", -1.0)
+    return turns
+
+
+def _compute_limb_turns(
+    angle: Mapping[str, Tensor], side: str, sign: float
+) -> dict[str, Tensor]:
+    """Return the turns (3, 3) of the bones of arm and leg of a side.
+
+    Args:
+        angle: of joints, degrees.
+        side: "left" or "right".
+        sign: 1 for the left, -1 for the right, which is its mirror image.
+    """
+    limb = {joint: angle[f"{side}_{joint}"] for joint, *_ in LIMBS}
+    suffix = side[0]
+    turns = dict[str, Tensor]()
+    raised = rotation_about("x", sign * limb["shoulder_out"]) @ rotation_about(
+        "y", -limb["shoulder"]
+    )
+    shoulder_turn = rotation_about("z", -sign * limb["shoulder_turn"])
+    turns[f"upperarm_{suffix}"] = raised @ shoulder_turn
+    turns[f"lowerarm_{suffix}"] = rotation_about("y", -limb["elbow"])
+    turns[f"thigh_{suffix}"] = rotation_about(
+        "x", sign * limb["hip_out"]
+    ) @ rotation_about("y", -limb["hip"])
+    turns[f"calf_{suffix}"] = rotation_about("y", limb["knee"])
+    turns[f"foot_{suffix}"] = rotation_about("y", -limb["ankle"])
     return turns
 
 

@@ -503,17 +503,24 @@ class Renderer:
         self.renders = renders_before + 1
         if not is_denoised:
             return exposed
-        with torch.no_grad():
-            noisy = exposed[..., :3].contiguous()
-            clean = denoise(
-                noisy,
-                guides[..., :3].contiguous(),
-                guides[..., 3:].contiguous(),
-                quick=self.formation.quick,
-            )
-            no_coverage = torch.zeros_like(exposed[..., 3:])
-            change = torch.cat([clean - noisy, no_coverage], dim=-1)
-        return exposed + change  # its derivative is that without a denoiser
+        # its derivative is that without a denoiser
+        return exposed + self._compute_denoising_change(exposed, guides)
+
+    @torch.no_grad()
+    def _compute_denoising_change(self, exposed: Tensor, guides: Tensor) -> Tensor:
+        """Return by how much a denoiser changes radiance (H, W, 3 or 4).
+
+        `guides` are albedo and normals (H, W, 6).
+        """
+        noisy = exposed[..., :3].contiguous()
+        clean = denoise(
+            noisy,
+            guides[..., :3].contiguous(),
+            guides[..., 3:].contiguous(),
+            quick=self.formation.quick,
+        )
+        no_coverage = torch.zeros_like(exposed[..., 3:])
+        return torch.cat([clean - noisy, no_coverage], dim=-1)
 
     def finish_image(
         self,
@@ -774,8 +781,8 @@ class _Radiance(torch.autograd.Function):
             renderer.gradients += 1
             for name, gradient in gradients.items():
                 by_input[name] = renderer.replace_non_finite(gradient)
-        no_gradients = (None,) * 6  # of the arguments before the tensors
-        return (*no_gradients, *(by_input.get(name) for name in ctx.names))
+        # six arguments before the tensors have no gradients
+        return (*(None,) * 6, *map(by_input.get, ctx.names))
 
 
 def _reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:

@@ -293,6 +293,14 @@ def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     )
 
 
+def _compute_shifts(origin: Tensor, columns: int) -> Tensor:
+    """Return (2, N), how far to the right and down the origin (N,) of each pixel is."""
+    pixel = torch.arange(len(origin))
+    right = origin % columns - pixel % columns
+    down = origin // columns - pixel // columns
+    return torch.stack([right, down])
+
+
 @lru_cache(maxsize=8)
 def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
     """Return from how far each pixel is taken behind frosted glass.
@@ -304,7 +312,7 @@ def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
         height: of the image.
         width: of the image.
         seed: chooses the neighbors.
-        whole: severity, a whole number.
+        severity: 1 to 5.
 
     Returns:
         (H, W, 2) to the right and down, in pixels of the reference image.
@@ -317,11 +325,8 @@ def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
         jumps = torch.randint(-reach, reach, (rows, columns, 2), generator=source)
         to_neighbor = (jumps[..., 0] * columns + jumps[..., 1]).flatten().tolist()
         _swap_in_neighbors(origins, to_neighbor, rows, columns, reach)
-    origin = torch.tensor(origins)
-    pixel = torch.arange(rows * columns)
-    right = origin % columns - pixel % columns
-    down = origin // columns - pixel // columns
-    shift = torch.stack([right, down]).view(1, 2, rows, columns).float()
+    shift = _compute_shifts(torch.tensor(origins), columns)
+    shift = shift.view(1, 2, rows, columns).float()
     return images.to_image(F.interpolate(shift, (height, width), mode="nearest-exact"))
 
 
@@ -342,7 +347,7 @@ def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     else:
         shift = interpolate_severity(
             severity,
-            lambda whole_severity: _elastic_shift(height, width, seed, whole_severity),
+            lambda level: _elastic_shift(height, width, seed, level),
         )
     return images.warp(image, compute_pixel_scale(image) * shift)
 
@@ -355,7 +360,7 @@ def _elastic_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
         height: of the image.
         width: of the image.
         seed: chooses the wrinkles and the shear.
-        whole: severity, a whole number.
+        severity: 1 to 5.
 
     Returns:
         (H, W, 2) to the right and down, in pixels of the reference image.

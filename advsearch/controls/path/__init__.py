@@ -844,8 +844,8 @@ def unwrap_headings(
     low = float(degrees.min())
     high = float(degrees.max())
     jumps = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
-    is_one_turn = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
-    if not len(jumps) or high - low >= 360.0 or not is_one_turn:
+    is_full_turn = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
+    if not len(jumps) or high - low >= 360.0 or not is_full_turn:
         return degrees, None
     first = f"{degrees[jumps[0]]:g}"
     last = f"{degrees[jumps[0] + 1]:g}"
@@ -882,6 +882,15 @@ def _read_text(path: Path) -> str:
         ) from error
 
 
+def _list_optional_columns(mover: str, is_single_path: bool) -> tuple[str, ...]:
+    """Return the columns that a table of waypoints may have besides time and position."""
+    if mover == OBJECT:
+        return (HEADING_COLUMN,)
+    if is_single_path:
+        return (*TARGET_COLUMNS, *OBJECT_SHIFT_COLUMNS, OBJECT_HEADING_COLUMN)
+    return TARGET_COLUMNS
+
+
 def read_waypoints(
     path: Path, mover: str, *, text: str, is_single_path: bool = True
 ) -> dict[str, Waypoints]:
@@ -899,23 +908,13 @@ def read_waypoints(
         FileFormatError: it is no table of numbers with the columns that a path needs,
             or its times do not ascend.
     """
-    optional: tuple[str, ...]
-    if mover == OBJECT:
-        optional = (HEADING_COLUMN,)
-    elif is_single_path:
-        optional = (*TARGET_COLUMNS, *OBJECT_SHIFT_COLUMNS, OBJECT_HEADING_COLUMN)
-    else:
-        optional = TARGET_COLUMNS
     header, rows = _read_csv(path, text)
-    _check_header(path, header, optional)
+    _check_header(path, header, _list_optional_columns(mover, is_single_path))
     table = _parse_numbers(path, header, rows)
-    times = table[:, header.index(TIME_COLUMN)] - table[0, header.index(TIME_COLUMN)]
+    column = {name: table[:, index] for index, name in enumerate(header)}
+    times = column.pop(TIME_COLUMN)
+    times = times - times[0]
     check_times(path, times)
-    column = {
-        name: table[:, index]
-        for index, name in enumerate(header)
-        if name != TIME_COLUMN
-    }
     if not all(np.abs(values).max() <= MAX_DISTANCE for values in column.values()):
         raise errors.FileFormatError(
             f"{path}: expected numbers within {MAX_DISTANCE:g}, got larger ones, or none"

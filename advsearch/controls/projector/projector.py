@@ -378,7 +378,7 @@ class ProjectorControl(PictureControl):
 
     @property
     def ambient(self) -> float | None:
-        slot = next(one for one in self.slots if one.parameter.name == "ambient")
+        slot = next(slot for slot in self.slots if slot.parameter.name == "ambient")
         return float(slot.spec.value) if isinstance(slot.spec, Fixed) else None
 
     def scale_ambient(self, factor: float) -> Self:

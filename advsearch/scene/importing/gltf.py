@@ -194,21 +194,12 @@ def is_splat_name(name: str) -> bool:
     return "gaussian_splat" in name.lower()
 
 
-def check_header(path: Path, header: Header) -> None:
-    """Check what the types of a header leave open.
+def _check_references(path: Path, header: Header) -> None:
+    """Check that everything that a header refers to is in the header.
 
     Raises:
-        FileFormatError: the header needs an extension that is not supported, refers to
-            what is not there, or is over a limit.
+        FileFormatError: it is not.
     """
-    needed = sorted(
-        name
-        for name in header.extensionsRequired
-        if name not in SUPPORTED_EXTENSIONS
-        and not name.startswith(_APPEARANCE_PREFIXES)
-    )
-    if needed:
-        raise _make_unsupported_error(path, needed)
     for entry in header.iterate_entries():
         for kind, index in entry.iterate_references():
             count = len(getattr(header, kind))
@@ -225,6 +216,24 @@ def check_header(path: Path, header: Header) -> None:
                 f"glTF with {max_index + 1} samplers of an animation, as it refers to",
                 f"{n_samplers}",
             )
+
+
+def check_header(path: Path, header: Header) -> None:
+    """Check what the types of a header leave open.
+
+    Raises:
+        FileFormatError: the header needs an extension that is not supported, refers to
+            what is not there, or is over a limit.
+    """
+    needed = sorted(
+        name
+        for name in header.extensionsRequired
+        if name not in SUPPORTED_EXTENSIONS
+        and not name.startswith(_APPEARANCE_PREFIXES)
+    )
+    if needed:
+        raise _make_unsupported_error(path, needed)
+    _check_references(path, header)
     accessor_sizes = (
         entry.count
         * entry.width

@@ -314,6 +314,14 @@ def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
     return plane
 
 
+def _intersect_ranges(
+    data_start: int, data_length: int, start: int, length: int
+) -> slice:
+    """Return what two ranges have in common; it stops before its start if nothing."""
+    stop = min(data_start + data_length, start + length)
+    return slice(max(data_start, start), stop)
+
+
 def _crop_to_display_window(
     header: Mapping[str, Any], planes: Planes, notes: list[str]
 ) -> Planes:
@@ -322,15 +330,13 @@ def _crop_to_display_window(
     (top, left), (height, width) = _read_window(header, "displayWindow")
     if (data_top, data_left) == (top, left) and data_size == (height, width):
         return planes
-    data_bottom = data_top + data_size[0]
-    data_right = data_left + data_size[1]
-    rows = slice(max(data_top, top), min(data_bottom, top + height))
-    columns = slice(max(data_left, left), min(data_right, left + width))
+    rows = _intersect_ranges(data_top, data_size[0], top, height)
+    columns = _intersect_ranges(data_left, data_size[1], left, width)
     is_cropped = (
         rows.start > data_top
         or columns.start > data_left
-        or rows.stop < data_bottom
-        or columns.stop < data_right
+        or rows.stop < data_top + data_size[0]
+        or columns.stop < data_left + data_size[1]
     )
     if is_cropped:
         notes.append("its data beyond the display window is left out")
@@ -347,13 +353,45 @@ def _crop_to_display_window(
             ]
         return result
 
-    red, green, blue = map(crop, planes)
-    return red, green, blue
+    red, green, blue = planes
+    return crop(red), crop(green), crop(blue)
 
 
 Bytes = npt.NDArray[np.uint8]
 _RESOLUTION = re.compile(rb"([-+])([YX]) +(\d{1,6}) +([-+])([YX]) +(\d{1,6})\r?\n")
 _NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+
+
+def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
+    """Return the pixels (H, W, 4) of a Radiance picture, row 0 on top.
+
+    Args:
+        path: of the picture, for messages.
+        body: what follows its header: a line with its size, and scanlines.
+
+    Raises:
+        FileFormatError: the size is none, or too large, or scanlines are missing.
+    """
+    size = _RESOLUTION.match(body)
+    if not size or not int(size[3]) or not int(size[6]) or size[2] == size[5]:
+        line = body[:30].split(b"\n")[0].decode("latin-1")
+        raise FileFormatError(
+            f"{path}: expected a size like '-Y 512 +X 1024', got "
+            f"{line!r}; save the picture again"
+        )
+    n_lines = int(size[3])
+    line_length = int(size[6])
+    check_pixels(path, line_length, n_lines)
+    pixels = _decode_scanlines(path, body[size.end() :], n_lines, line_length)
+    # Flip it so that it begins at the top and at the left.
+    line_step, pixel_step = (
+        1 if sign + axis in (b"-Y", b"+X") else -1
+        for sign, axis in (size.group(1, 2), size.group(4, 5))
+    )
+    pixels = pixels[::line_step, ::pixel_step]
+    if size[2] != b"Y":
+        pixels = pixels.transpose(1, 0, 2)
+    return pixels
 
 
 def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[str]]:
@@ -381,25 +419,7 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
         raise FileFormatError(
             f"{path}: expected FORMAT=32-bit_rle_rgbe, got {got}; convert it to RGB"
         )
-    size = _RESOLUTION.match(body)
-    if not size or not int(size[3]) or not int(size[6]) or size[2] == size[5]:
-        line = body[:30].split(b"\n")[0].decode("latin-1")
-        raise FileFormatError(
-            f"{path}: expected a size like '-Y 512 +X 1024', got "
-            f"{line!r}; save the picture again"
-        )
-    n_lines = int(size[3])
-    line_length = int(size[6])
-    check_pixels(path, line_length, n_lines)
-    pixels = _decode_scanlines(path, body[size.end() :], n_lines, line_length)
-    # Flip it so that it begins at the top and at the left.
-    line_step, pixel_step = (
-        1 if sign + axis in (b"-Y", b"+X") else -1
-        for sign, axis in (size.group(1, 2), size.group(4, 5))
-    )
-    pixels = pixels[::line_step, ::pixel_step]
-    if size[2] != b"Y":
-        pixels = pixels.transpose(1, 0, 2)
+    pixels = _read_upright_pixels(path, body)
     factors, notes = _read_color_corrections(header)
     return pixels, factors, notes
 

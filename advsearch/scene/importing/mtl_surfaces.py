@@ -737,8 +737,8 @@ def _parse_pair(options: dict[str, str], key: str, default: Pair) -> Pair:
 
     Numbers that are too large to compute with are replaced by the defaults.
     """
-    words = options.get(key, "").split()[:2]
-    u, v = (*map(float, words), *default[len(words) :])
+    numbers = [float(word) for word in options.get(key, "").split()[:2]]
+    u, v = [*numbers, *default[len(numbers) :]]
     return (u, v) if abs(u) < 1e6 and abs(v) < 1e6 else default
 
 

@@ -158,13 +158,15 @@ def read_contents(path: Path) -> PluginContents:
     cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
     known = {*objects, *cameras}
     replaced = INTEGRATOR_TYPES | SENSOR_TYPES
-    kept = {
+    other_kinds = {
         name: kind
         for name, kind in kinds.items()
         if name not in known and kind not in replaced
     }
     lights = tuple(name for name, plugin in named.items() if _emits_light(plugin))
-    return PluginContents(objects, kept, lights, tuple(map(_rename_reserved, cameras)))
+    return PluginContents(
+        objects, other_kinds, lights, tuple(map(_rename_reserved, cameras))
+    )
 
 
 def _rename_reserved(name: str) -> str:

@@ -69,6 +69,23 @@ SHAPE_ENTRIES = MESH_ENTRIES | {
 """The same for any shape."""
 
 
+def _load_any_buffers(shape: Mapping[str, object], name: str) -> Buffers:
+    """Return the buffers of a shape, whether Mitsuba has a mesh of it or not.
+
+    Raises:
+        InputError: the shape has no triangles.
+    """
+    kind = str(shape["type"])
+    if kind not in OBJECT_SHAPES:
+        raise InputError(
+            f"object {name}: a {kind} cannot be moved; expected a shape "
+            f"of {', '.join(OBJECT_SHAPES)}"
+        )
+    if kind in TESSELLATED_SHAPES:
+        return _tessellate(kind, shape, name)
+    return _load_buffers(shape, name)
+
+
 def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]:
     """Return the triangles of a shape in a Mitsuba scene.
 
@@ -88,17 +105,7 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
     Raises:
         InputError: the shape has no triangles, or vertices that are not finite.
     """
-    kind = str(shape["type"])
-    if kind not in OBJECT_SHAPES:
-        raise InputError(
-            f"object {name}: a {kind} cannot be moved; expected a shape "
-            f"of {', '.join(OBJECT_SHAPES)}"
-        )
-    if kind in TESSELLATED_SHAPES:
-        buffers = _tessellate(kind, shape, name)
-    else:
-        buffers = _load_buffers(shape, name)
-    vertices, faces, normals, uvs, attributes = buffers
+    vertices, faces, normals, uvs, attributes = _load_any_buffers(shape, name)
     if not np.isfinite(vertices).all():
         raise InputError(
             f"object {name}: expected finite vertices, got NaN or "
@@ -310,7 +317,6 @@ def find_haze(
         return None
     ball_name, medium_name = names
     ball = named[ball_name]
-    medium = named[medium_name]
     pose = matrix @ get_pose(ball)
     center = pose @ np.append(
         np.broadcast_to(_parse_numbers(ball.get("center", np.zeros(3))), (3,)), 1.0
@@ -322,6 +328,20 @@ def find_haze(
     ):
         return None
 
+    coefficients = _read_haze_medium(named[medium_name], matrix)
+    if coefficients is None:
+        return None
+    haze = HazePart(ball_name, radius, *coefficients)
+    return haze, frozenset((ball_name, medium_name))
+
+
+def _read_haze_medium(
+    medium: Mapping[str, object], matrix: Float64Array
+) -> tuple[float, tuple[float, float, float]] | None:
+    """Return extinction, in the object's lengths, and albedo of a medium.
+
+    None if it is not grey, or out of range; `matrix` is as in `find_haze`.
+    """
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
     object_size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
@@ -331,8 +351,7 @@ def find_haze(
     if not (is_grey and MIN_ALBEDO <= min(albedo) and max(albedo) <= 1.0):
         return None
     red, green, blue = albedo
-    haze = HazePart(ball_name, radius, float(extinction[0]), (red, green, blue))
-    return haze, frozenset((ball_name, medium_name))
+    return float(extinction[0]), (red, green, blue)
 
 
 def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:

@@ -97,6 +97,16 @@ class ViewSamples:
     is_back: Tensor  # (k,) bool, whether it is seen from behind
 
 
+def _select_ray_offset(ray_index: Any) -> tuple[Any, Any]:
+    """Return where in its pixel each ray goes, in pixels to the right and down."""
+    x_offset = mi.Float(RAY_PATTERN[0][0])
+    y_offset = mi.Float(RAY_PATTERN[0][1])
+    for index, offset in enumerate(RAY_PATTERN[1:], 1):
+        x_offset = dr.select(ray_index == index, offset[0], x_offset)
+        y_offset = dr.select(ray_index == index, offset[1], y_offset)
+    return x_offset, y_offset
+
+
 class ViewTracer:
     """Trace rays through many cameras of a scene in one recorded launch.
 
@@ -268,11 +278,7 @@ class ViewTracer:
         ray_index = lane % RAYS_PER_PIXEL
         view = pixel // (height * width)
         pixel = pixel % (height * width)
-        x_offset = mi.Float(RAY_PATTERN[0][0])
-        y_offset = mi.Float(RAY_PATTERN[0][1])
-        for index, offset in enumerate(RAY_PATTERN[1:], 1):
-            x_offset = dr.select(ray_index == index, offset[0], x_offset)
-            y_offset = dr.select(ray_index == index, offset[1], y_offset)
+        x_offset, y_offset = _select_ray_offset(ray_index)
         camera = [
             dr.gather(mi.Float, cameras, view * CAMERA_SIZE + index)
             for index in range(CAMERA_SIZE)

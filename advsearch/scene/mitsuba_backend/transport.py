@@ -180,6 +180,17 @@ def _accumulate_radiance(
     return L, vertices
 
 
+def _find_weighted_samples(
+    vertices: list[tuple[Any, Any, Any]], n_samples: int
+) -> list[Any]:
+    """Return for each vertex which samples have a weight that is finite and not 0."""
+    every_sample = dr.full(mi.Bool, True, n_samples)
+    return [
+        every_sample & dr.any(weight != 0.0) & dr.all(dr.isfinite(weight))
+        for _, weight, _ in vertices
+    ]
+
+
 def _fetch_paths(
     channels: list[Any],
     vertices: list[tuple[Any, Any, Any]],
@@ -188,11 +199,7 @@ def _fetch_paths(
 ) -> Paths:
     """Evaluate the kernel of a pass and fetch images and vertices into torch."""
     n_samples = size[0] * size[1] * spp
-    every_sample = dr.full(mi.Bool, True, n_samples)
-    has_weight = [
-        every_sample & dr.any(weight != 0.0) & dr.all(dr.isfinite(weight))
-        for _, weight, _ in vertices
-    ]
+    has_weight = _find_weighted_samples(vertices, n_samples)
     dr.eval(channels, vertices, has_weight)  # one kernel for the whole path
     means = [dr.block_sum(channel, spp) / spp for channel in channels]
     dr.eval(means)

@@ -197,6 +197,19 @@ class SurfaceRenderer(Predictor):
             self.n_dropped += 1
         return light, torch.ones(3)
 
+    def _choose_light(
+        self, inputs: Mapping[str, Tensor]
+    ) -> tuple[ArrangementLight, Tensor | float]:
+        """Return the light of scene inputs and its factor, or the fixed light."""
+        if self.fixed_light is None:
+            return self.get_light(inputs)
+        return self.fixed_light, 1.0
+
+    def _select_camera_inputs(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the inputs that are the camera's, completed by those of the scene."""
+        names = CAMERA_INPUTS & self._base.keys()
+        return {name: inputs.get(name, self._base[name]) for name in names}
+
     def trace_views(
         self, inputs: Sequence[Mapping[str, Tensor]]
     ) -> Iterator[LitCameraView]:
@@ -205,19 +218,12 @@ class SurfaceRenderer(Predictor):
         Those under one environment are traced in one launch, while the results of the
         launch before are used.
         """
-        lights: list[tuple[ArrangementLight, Tensor | float]] = []
-        for camera_inputs in inputs:
-            if self.fixed_light is None:
-                lights.append(self.get_light(camera_inputs))
-            else:
-                lights.append((self.fixed_light, 1.0))
+        lights = [self._choose_light(camera_inputs) for camera_inputs in inputs]
         cameras_of_light: dict[ArrangementLight, list[int]] = {}
         for number, (light, _) in enumerate(lights):
             cameras_of_light.setdefault(light, []).append(number)
-        names = CAMERA_INPUTS & self._base.keys()
         cameras = [
-            {name: camera_inputs.get(name, self._base[name]) for name in names}
-            for camera_inputs in inputs
+            self._select_camera_inputs(camera_inputs) for camera_inputs in inputs
         ]
         launches = (
             self.arrangement.start_tracing(

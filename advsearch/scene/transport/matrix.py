@@ -522,19 +522,20 @@ def _collect(
 ) -> LinearizedScene:
     """Trace what a `LinearRenderer` needs; arguments as there."""
     non_finite_before = renderer.non_finite
-    inputs = renderer.scene.assembly(renderer.space.inputs(u))
-    applied = {name: value for name, value in inputs.items() if name in IMAGE_INPUTS}
-    traced = {name: value for name, value in inputs.items() if name not in IMAGE_INPUTS}
+    traced = dict(renderer.scene.assembly(renderer.space.inputs(u)))
+    applied = {name: traced.pop(name) for name in list(traced) if name in IMAGE_INPUTS}
     traced |= dict(light)
     linear = find_linear_inputs(renderer) if names is None else names
-    there = {name: value.clone() for name, value in traced.items() if name in linear}
+    linearized_at = {
+        name: value.clone() for name, value in traced.items() if name in linear
+    }
     transports = {
         name: TextureTransport(
             renderer.formation.resolution,
             (value.shape[0], value.shape[1]),
             small=quick,
         )
-        for name, value in there.items()
+        for name, value in linearized_at.items()
     }
     hide = "backdrop.color" in applied
     if not transports:
@@ -551,7 +552,7 @@ def _collect(
             base = torch.cat([base, paths.coverage], dim=-1)
     return LinearizedScene(
         transports=transports,
-        linearized_at=there,
+        linearized_at=linearized_at,
         image_inputs=applied,
         base_image=PackedImage(base, is_small=quick),
         non_finite=renderer.non_finite - non_finite_before,
