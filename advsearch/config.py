@@ -636,7 +636,7 @@ class DerivativeConfig(SceneConfig):
         *SceneConfig.clashes,
         Clash(
             "epsilon",
-            lambda config: config.epsilons and "epsilon" not in config.several,
+            lambda config: config.epsilons and "epsilon" not in config.list_settings,
             "several make a curve, which only `advsearch attack` draws; give one",
         ),
     )

@@ -36,7 +36,7 @@ from advsearch.viewer.pages import write_result
 
 Settings = TypeVar("Settings", bound=Config, covariant=True)
 AnyResult = TypeVar("AnyResult", bound=Result)
-ResultType = TypeVar("Made", bound=Result)
+ResultType = TypeVar("ResultType", bound=Result)
 
 SHARED_RESULT_FIELDS = {
     "object": "object",

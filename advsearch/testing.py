@@ -203,7 +203,7 @@ def _assert_claim(
             "claims": {claim_name: claim_settings},
         }
         config = experiment.settings(suite=title, run=None if run is None else str(run))
-        config = config.with_only_here(python_only).with_python_objects(objects)
+        config = config.with_python_only_parts(python_only).with_python_objects(objects)
         result: SuiteResult = experiment.run(config, suite=suite)
     (claim_result,) = result.claims
     if claim_result.answer != "held":
@@ -227,17 +227,17 @@ def _name_objects(
     named = dict(settings)
     objects: dict[tuple[str, str], Any] = {}
     if isinstance(object, loading.Scene):
-        scene_settings = loading.scene_as_settings(object)
+        scene_settings = loading.scene_to_settings(object)
         named |= {
             name: value for name, value in scene_settings.items() if value is not None
         }
         objects["scene", named["object"]] = object
     else:
         named["object"] = str(object)
-    controls = loading.instances_in(named.get("controls", ()))
+    controls = loading.list_control_instances(named.get("controls", ()))
     if controls:
         objects |= {("control", control.name): control for control in controls}
-        named["controls"] = loading.settings_of(named["controls"])
+        named["controls"] = loading.controls_to_settings(named["controls"])
     return named, objects
 
 

@@ -376,7 +376,7 @@ def take_projective(scene: Any) -> None:
     """Let Mitsuba's projective integrator, with guiding off, take the place of the
     material form.
     """
-    with_boundary = scene.like(leave_out=ALL_OMISSIONS - {"boundary"})
+    with_boundary = scene.copy_with(leave_out=ALL_OMISSIONS - {"boundary"})
 
     def adjoint(
         inputs: dict[str, Tensor], cotangent: Tensor, seed: int, spp: int, **_: object
@@ -387,7 +387,7 @@ def take_projective(scene: Any) -> None:
         )
         return found
 
-    scene.material_adjoint = adjoint
+    scene.render_material_adjoint = adjoint
 
 
 def _squared(value: Tensor) -> float:

@@ -237,7 +237,7 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
         )
         loss = make_smooth_loss(renderer.formation.resolution, config.seed)
         bench = GradientBench(renderer, loss, find_interior_point(renderer), part)
-    bench.refer(budget, SEED, lambda: None)
+    bench.compute_references(budget, SEED, lambda: None)
     samples = [
         bench.measure(setting, SEED + number)[found.quantity]
         for number in range(REPEATS)

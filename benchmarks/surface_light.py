@@ -380,10 +380,10 @@ def simulated(searches: int = 4000) -> None:
         moved = bias + deviation * normal[1]
         good = sum(
             compare_views(
-                lambda n, one=one: ComparedView(
+                lambda n, one=one: ComparedView(  # type: ignore[misc]
                     16.0 * float(squares[one, n]), 16.0, float(moved[one, n]), 3
                 )
-            ).is_accepted  # type: ignore[misc]
+            ).is_accepted
             for one in range(searches)
         )
         return f"{100.0 * good / searches:5.1f}"

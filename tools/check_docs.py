@@ -199,10 +199,11 @@ def policies() -> Iterator[str]:
         if row is None:
             options = (
                 ", ".join(
-                    f"`{one.name}` (its range; {one.default})" for one in fields(policy)
+                    f"`{one.name}` (its range; {one.default})"
+                    for one in fields(policy)  # type: ignore[arg-type]
                 )
                 or "none"
-            )  # type: ignore[arg-type]
+            )
             gradients = (
                 "yes" if getattr(policy, "uses_gradient", True) is True else "no"
             )

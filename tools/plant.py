@@ -87,8 +87,8 @@ FAULTS = (
     Fault(
         "mitsuba_backend: an sRGB colour is taken for a linear one",
         "advsearch/scene/mitsuba_backend/meshes.py",
-        '"base_color": texture(srgb_to_linear(part.base_color)),',
-        '"base_color": texture(part.base_color),',
+        '"base_color": make_texture(srgb_to_linear(part.base_color)),',
+        '"base_color": make_texture(part.base_color),',
         ("tests/scene/test_renderer.py", "tests/scene/test_exposure.py"),
     ),
     Fault(
@@ -101,8 +101,8 @@ FAULTS = (
     Fault(
         "importing: the stride of a buffer is ignored",
         "advsearch/scene/importing/gltf.py",
-        "data, step = self.view(view), stride or shape[1] * kind.itemsize",
-        "data, step = self.view(view), shape[1] * kind.itemsize",
+        "step = stride or row_size",
+        "step = row_size",
         ("tests/scene/test_gltf.py",),
     ),
     Fault(
@@ -122,7 +122,7 @@ FAULTS = (
     Fault(
         "controls: the exposure counts twice",
         "advsearch/controls/camera.py",
-        'values["exposure"] - scene.number("camera.exposure")',
+        'values["exposure"] - scene.number(\n                "camera.exposure"\n            )',
         'values["exposure"]',
         ("tests/controls/test_clean.py",),
     ),
@@ -158,8 +158,8 @@ FAULTS = (
     Fault(
         "tasks: a mask is inverted",
         "advsearch/tasks/segmentation.py",
-        "chosen = output.permute(0, 2, 3, 1)[:, mask]",
-        "chosen = output.permute(0, 2, 3, 1)[:, ~mask]",
+        "selected = output.permute(0, 2, 3, 1)[:, mask]",
+        "selected = output.permute(0, 2, 3, 1)[:, ~mask]",
         ("tests/tasks/test_segmentation.py",),
     ),
     Fault(
@@ -172,8 +172,7 @@ FAULTS = (
     Fault(
         "attacks: a projection is left out",
         "advsearch/attacks/domain.py",
-        "project_l2_box(u[part], self.start[part], block.epsilon, block.low, "
-        "block.high)",
+        "project_l2_box(\n                    u[part], self.start[part], block.epsilon, block.low, block.high\n                )",
         "u[part].clamp(block.low, block.high)",
         ("tests/attacks/test_attacks_domain.py",),
     ),
@@ -187,8 +186,8 @@ FAULTS = (
     Fault(
         "attacks: trials of the wrong group count",
         "advsearch/attacks/verification.py",
-        "self.conditional or clean.successes >= self.needed(clean.trials)",
-        "self.conditional or adversarial.successes >= self.needed(adversarial.trials)",
+        "or clean.successes >= self.count_needed(clean.trials)",
+        "or adversarial.successes >= self.count_needed(adversarial.trials)",
         ("tests/attacks/test_attacks_verification.py",),
     ),
     Fault(
@@ -201,7 +200,7 @@ FAULTS = (
     Fault(
         "policies: a mean keeps its bias",
         "advsearch/attacks/policies/pgd.py",
-        "mean = state.direction / (1.0 - self.beta1**state.taken)",
+        "mean = state.direction / (1.0 - self.beta1**state.n_steps_taken)",
         "mean = state.direction",
         ("tests/attacks/policies/test_policy_adam.py",),
     ),
@@ -215,15 +214,15 @@ FAULTS = (
     Fault(
         "engine: answers of workers come as they are done",
         "advsearch/engine/journal.py",
-        "number = numbers[id(done.items[0])]",
-        "number = turn + len(early)",
+        "index = index_of_item[id(result.items[0])]",
+        "index = next_index + len(waiting)",
         ("tests/engine/test_attack_workers.py",),
     ),
     Fault(
         "sweeps: a rate of another group",
         "advsearch/questions/sweep/result.py",
-        "answer=counted_by_unit(after, draws, outcome_after),",
-        "answer=counted_by_unit(before, draws, outcome_before),",
+        "answer=count_by_unit(adversarial, draws, adversarial_outcome),",
+        "answer=count_by_unit(clean, draws, clean_outcome),",
         ("tests/engine/test_sweep.py",),
     ),
     Fault(
@@ -257,8 +256,7 @@ FAULTS = (
     Fault(
         "report: the bleed is printed as a part of the size",
         "advsearch/report/sheets.py",
-        "(width - 2 * self.bleed[0]) * self.pixel[0], (height - 2 * self.bleed[1]) * "
-        "self.pixel[1]",
+        "(width - 2 * self.bleed[0]) * self.pixel[0], (\n            height - 2 * self.bleed[1]\n        ) * self.pixel[1]",
         "width * self.pixel[0], height * self.pixel[1]",
         ("tests/report/test_sheets.py",),
     ),
@@ -286,7 +284,7 @@ FAULTS = (
     Fault(
         "cluster: any version may work",
         "advsearch/cluster/dask_executor.py",
-        "if its_version == version():",
+        "if its_version == compute_version():",
         "if isinstance(its_version, str):",
         ("tests/cluster/test_executors.py",),
     ),
@@ -322,29 +320,28 @@ FAULTS = (
     Fault(
         "explain: what chance adds is not taken off",
         "advsearch/questions/explain/importance.py",
-        "corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / max(n_rows - n_groups, "
-        "1)",
+        "corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / residual_degrees",
         "corrected_share = share",
         ("tests/questions/test_rules.py",),
     ),
     Fault(
         "recipes: right and wrong are mixed up",
         "advsearch/questions/recipe/rates.py",
-        "for a in (True, False) for b in (True, False)]",
-        "for b in (True, False) for a in (True, False)]",
+        "for rendering_is_right in (True, False):\n        for other_is_right in (True, False):",
+        "for other_is_right in (True, False):\n        for rendering_is_right in (True, False):",
         ("tests/questions/test_recipe.py",),
     ),
     Fault(
         "hardening: what judges is trained on",
         "advsearch/questions/harden/training.py",
-        "own, model = [copy.copy(lesson) for lesson in held_back], self.student.model",
-        "own, model = list(held_back), self.student.model",
+        "searched = [copy.copy(lesson) for lesson in held_back]",
+        "searched = list(held_back)",
         ("tests/questions/test_hardening.py",),
     ),
     Fault(
         "hardening: plain pictures may be lost",
         "advsearch/questions/harden/rounds.py",
-        "return clean >= self.done[0].clean - self.config.clean_loss - 1e-9",
+        "return clean >= self.results[0].clean - self.config.clean_loss - 1e-9",
         "return True",
         ("tests/questions/test_hardening.py",),
     ),

@@ -35,7 +35,7 @@ from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
 from advsearch.runs.files import read_png, to_8bit
 from advsearch.scene.assembly import IMAGE_INPUTS, pose_mesh
-from advsearch.scene.assets import Float32Array, IntArray, Mesh, Shape
+from advsearch.scene.assets import Float32Array, Float64Array, IntArray, Mesh, Shape
 from advsearch.scene.description import NO_ENVIRONMENT, OBJECT
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import compute_doubled_areas, rasterize_charts
@@ -292,7 +292,7 @@ def _extend_inside(image: Float32Array, inside: Mask) -> Float32Array:
 
 
 def _measure_texel_size(
-    positions: Float32Array, inside: Mask
+    positions: Float64Array, inside: Mask
 ) -> tuple[tuple[float, float], float] | None:
     """Measure the texels of a part on the surface.
 

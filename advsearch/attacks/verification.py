@@ -370,14 +370,19 @@ def verify(
     for look in looks:
         # Under conditions, clean trials that are wrong do not count: more are run.
         count = look
-        clean_trials += run_clean(trials=count, first=len(clean_trials))
+        clean_trials += run_clean(trials=count, first_index=len(clean_trials))
         n_missing = look - rule.count_valid(clean_trials[:count])
         while n_missing > 0 and count < looks[-1]:
             count = min(count + n_missing, looks[-1])
-            clean_trials += run_clean(trials=count, first=len(clean_trials))
+            clean_trials += run_clean(trials=count, first_index=len(clean_trials))
             n_missing = look - rule.count_valid(clean_trials[:count])
         done += run(
-            u, trials=count, first=len(done), kind=kind, keep=n_images, until=until
+            u,
+            trials=count,
+            first_index=len(done),
+            kind=kind,
+            n_images=n_images,
+            is_decided=until,
         )
         is_early = count < looks[-1]
         n_needed = rule.count_needed(

@@ -133,7 +133,7 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
         )
         if len(nodes) > 1:
             lines.append(
-                f"Another one moves with it: --control pose,pose:{nodes[0].mesh}"
+                f"Another one moves with it: --control pose,pose:{nodes[0].mesh_name}"
             )
     listed = {
         "materials (--control 'texture={materials: [NAME]}')": materials,

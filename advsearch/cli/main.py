@@ -122,7 +122,7 @@ class ExperimentCommand:
                 metavar=positional.metavar,
                 nargs="*" if positional.is_repeatable else "?",
                 default=argparse.SUPPRESS,
-                help=f"as `--{about}`{positional.more}",
+                help=f"as `--{about}`{positional.help_suffix}",
             )
         if about:
             output.add_code_flag(parser)

@@ -537,7 +537,7 @@ class Retrials:
             if key not in self._radiances:
                 self._radiances[key] = renderer.radiance(full_u, seed, condition.spp)
             displayed = renderer.formation.display(self._radiances[key])
-            return round_to_8_bit(renderer.space.picture(full_u, displayed))
+            return round_to_8_bit(renderer.space.apply_to_image(full_u, displayed))
 
 
 def read_stored_configuration(directory: Path, problem: Problem) -> torch.Tensor:

@@ -726,7 +726,7 @@ class AddressModel(models.RemoteNetwork):
         )
         if is_stated:
             tokens_in, tokens_out = counts
-            self.spent.update(tokens_in=tokens_in, tokens_out=tokens_out)
+            self.spent.update({"tokens_in": tokens_in, "tokens_out": tokens_out})
             self._store_spent()
         elif self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token:
             raise self._make_error(

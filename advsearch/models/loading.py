@@ -133,10 +133,10 @@ def load_model(
     read = read or (task and task.reader)
     names = None if labels is None else read_labels(labels)
     origin = find_labels_origin(labels)
-    if names is not None and task and task.names_from:
+    if names is not None and task and task.names_source:
         raise InputError(
             f"labels: the names of task {task.name} are those of "
-            f"{task.names_from}; leave `labels` out"
+            f"{task.names_source}; leave `labels` out"
         )
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
     purpose = Purpose(
@@ -161,7 +161,7 @@ def load_model(
     if isinstance(source, Source) and isinstance(source.module, nn.Module):
         called_under(source.module, switches)
     if task:
-        source = replace(source, module=task.wrapped(source.module))
+        source = replace(source, module=task.wrap_network(source.module))
     if (
         isinstance(source, Source)
         and source.takes_more

@@ -508,7 +508,7 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
                 rows, gradient = _compute_gradient(model, images)
             except RuntimeError as error:
                 # What the network detaches may be all that has a gradient.
-                if not (repeatable and detaching.seen):
+                if not (repeatable and detaching.has_detached):
                     raise
                 reason = first_line(error)
                 with torch.no_grad():
@@ -517,11 +517,11 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
         if model.read is not None and not bool(rows[:, 0].any()):
             # It detects nothing in noise: rendered images will show its gradient.
             return dataclasses.replace(model, differentiable=True)
-        if repeatable and detaching.seen:
+        if repeatable and detaching.has_detached:
             model, gradient = _try_attached(model, images, gradient)
         has_gradient = bool((gradient != 0).any())
         if has_gradient and repeatable:
-            is_detached = detaching.seen and not model.attached
+            is_detached = detaching.has_detached and not model.attached
             _check_gradient(model, images, gradient, is_detached)
     except (RuntimeError, ModelError) as error:
         has_gradient = False

@@ -272,7 +272,7 @@ class Person:
             *(index for index, parent in enumerate(self._parents) if parent == foot),
         ]
 
-    def measured(
+    def get_measurements(
         self, values: Mapping[str, Tensor], clip: str | None = None
     ) -> Mapping[str, Value]:
         """Return the mass of the person."""

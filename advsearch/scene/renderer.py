@@ -73,19 +73,19 @@ class InputSpace(InputMapping, Protocol):
     def groups(self) -> tuple[Group, ...]:
         """Every group of coordinates with its valid estimators."""
 
-    def later(self, seconds: float) -> InputMapping:
+    def advance_time(self, seconds: float) -> InputMapping:
         """Return what maps u to scene inputs some seconds later."""
 
-    def picture(self, u: Tensor, image: Tensor) -> Tensor:
+    def apply_to_image(self, u: Tensor, image: Tensor) -> Tensor:
         """Change the finished image; differentiable."""
 
-    def printed(self, u: Tensor) -> dict[str, Tensor]:
+    def get_printable_colors(self, u: Tensor) -> dict[str, Tensor]:
         """Return the colors that are searched, (h, w, 3) or (h, w, 4), by control.
 
         They are differentiable.
         """
 
-    def numbers(self, u: Tensor) -> dict[str, Tensor]:
+    def get_numeric_values(self, u: Tensor) -> dict[str, Tensor]:
         """Return the numbers of the configuration, in their units, by name.
 
         They are differentiable.
@@ -281,11 +281,11 @@ class Renderer:
                 slope = (
                     self.formation.display(nudged) - curve_point
                 ) / STRAIGHT_FRACTION
-                return self.space.picture(u, curve_point + slope)
+                return self.space.apply_to_image(u, curve_point + slope)
 
             first = display_straight(halves[0])
             second = display_straight(halves[1])
-            return first, second, self.space.picture(u, curve_point)
+            return first, second, self.space.apply_to_image(u, curve_point)
 
     def _trace_halves(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
@@ -466,7 +466,7 @@ class Renderer:
         if space is None:
             space = self.space
             if mount is not None and mount.delay:
-                space = self.space.later(mount.delay)
+                space = self.space.advance_time(mount.delay)
         inputs = self.scene.assembly(space.inputs(u))
         if mount is None:
             return inputs
@@ -548,7 +548,7 @@ class Renderer:
             radiance = radiance + uncovered * (backdrop / self.formation.gain)
         if not display:
             return radiance
-        return self.space.picture(u, self.formation.display(radiance))
+        return self.space.apply_to_image(u, self.formation.display(radiance))
 
     def render_radiance(
         self,
@@ -656,9 +656,9 @@ class Renderer:
                 if not tensor.requires_grad:
                     continue
                 weights = torch.rand(tensor.shape, generator=generator)
-                (gradient,) = torch.autograd.grad(
+                gradient: Tensor | None = torch.autograd.grad(
                     (tensor * weights).sum(), u, retain_graph=True, allow_unused=True
-                )
+                )[0]
                 if gradient is None:
                     continue
                 for group in groups:
@@ -815,5 +815,5 @@ class _Differences(torch.autograd.Function):
     @forbid_second_derivatives
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         (u,) = ctx.saved_tensors
-        derivative = ctx.renderer.differences(u, cotangent, ctx.seed, ctx.spp)
+        derivative = ctx.renderer.compute_differences(u, cotangent, ctx.seed, ctx.spp)
         return None, None, None, derivative, cotangent

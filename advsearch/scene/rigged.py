@@ -204,7 +204,7 @@ class SkeletonRig:
         )
         return tuple(parameter for parameter in parameters if parameter is not None)
 
-    def measured(
+    def get_measurements(
         self, values: Mapping[str, Tensor], clip: str | None = None
     ) -> Mapping[str, Value]:
         """Return the time in a clip, in seconds."""

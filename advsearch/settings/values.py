@@ -125,7 +125,7 @@ def parse_assignments(texts: Iterable[str], setting: str) -> dict[str, object]:
         ValueError: a text is no assignment.
         InputError: a name comes twice.
     """
-    texts = list(text_validator)
+    texts = list(texts)
     for text in texts:
         name, equals, _ = text.partition("=")
         if not name.strip() or not equals:

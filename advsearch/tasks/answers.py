@@ -221,8 +221,8 @@ def _token_lead(
 def _texts(answer: AnswerWithLogits | AnswersWithoutLogits) -> list[str]:
     """Return all texts of an answer."""
     if "texts" in answer:
-        return answer["texts"]
-    return [answer["text"]]  # type: ignore[typeddict-item]
+        return answer["texts"]  # type: ignore[typeddict-item]
+    return [answer["text"]]
 
 
 def _prediction(text: str) -> tasks.Prediction:

@@ -93,7 +93,7 @@ class Rig(tasks.JointTask):
         )
 
     def with_objective(self, objective: str) -> Rig:
-        return replace(self, part=self.part.seeking(objective))
+        return replace(self, part=self.part.with_objective(objective))
 
     def check(self, facts: tasks.Facts) -> None:
         self.part.check(facts)
@@ -154,7 +154,7 @@ class Rig(tasks.JointTask):
         self, output: Sequence[tasks.Outputs], count: int = 1
     ) -> list[tuple[tasks.Prediction, ...]]:
         """Return the joint prediction of the images of each rig."""
-        predictions_of_rigs = []
+        predictions_of_rigs: list[tuple[tasks.Prediction, ...]] = []
         for image_outputs in output:
             predictions = [
                 self.part.predictions(image_output)[0][0]
@@ -176,7 +176,7 @@ class Rig(tasks.JointTask):
                 self.part.judge(image_output, image_truth)[0]
                 for image_output, image_truth in zip(image_outputs, truth, strict=True)
             ]
-            if any(judgement.not_a_number for judgement in judgements):
+            if any(judgement.is_not_a_number for judgement in judgements):
                 margin = math.nan
             image_payloads: list[tasks.JsonValue] = [
                 {

@@ -104,8 +104,8 @@ def test_a_loss_that_leads_the_wrong_way_is_refused(scene: advsearch.Scene) -> N
 def test_a_space_has_what_a_loss_can_ask_for(scene: advsearch.Scene) -> None:
     """Type checkers know it: mypy reads this test."""
     render = scene.renderer({"texture": {"resolution": 4}, "pose": {"yaw": [0, 90]}}, resolution=8)
-    assert render.space.printed(render.start)["texture"].shape == (4, 4, 3)
-    assert float(render.space.numbers(render.start)["pose.yaw"]) == pytest.approx(0.0, abs=1e-4)
+    assert render.space.get_printable_colors(render.start)["texture"].shape == (4, 4, 3)
+    assert float(render.space.get_numeric_values(render.start)["pose.yaw"]) == pytest.approx(0.0, abs=1e-4)
 
 
 @pytest.mark.medium

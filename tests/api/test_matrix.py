@@ -81,7 +81,7 @@ def test_every_adversarial_scene_is_tried_on_every_model(
 def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
     whole: MatrixResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, done = Retrials._rendered, 0
+    real, done = Retrials._render, 0
 
     def stopped(*given: Any) -> Any:
         nonlocal done

@@ -43,7 +43,7 @@ class Backwards:
         self.call, self.lost = parts.attacks_of(work.settings), lost
         assert work.function == "advsearch.questions.attack.studies:attacks_of"
 
-    def results(self, ranges: Iterable[range]) -> Iterator[BatchResult]:
+    def compute(self, ranges: Iterable[range]) -> Iterator[BatchResult]:
         for one in reversed(list(ranges)):
             yield BatchResult(one, None if self.lost else self.call(one), "elsewhere", lost=self.lost)
 

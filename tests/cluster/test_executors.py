@@ -81,7 +81,7 @@ from advsearch.cluster import WorkerTask
 from advsearch.cluster.workers import open_workers
 task = WorkerTask("cluster_work:squares", {"seconds": 600.0})
 with open_workers(task, workers=1, cluster=None, tell=print) as executor:
-    list(executor.results([range(1)]))
+    list(executor.compute([range(1)]))
 """
     environ = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, env=environ) as asking:
@@ -133,7 +133,7 @@ def test_a_worker_imports_nothing_from_the_current_folder(tmp_path: Path) -> Non
         "from advsearch.cluster import WorkerTask\n"
         "from advsearch.cluster.workers import open_workers\n"
         "with open_workers(WorkerTask('cluster_work:squares', {}), workers=1, cluster=None, tell=print) as workers:\n"
-        "    print([done.value for done in workers.results([range(3)])])\n"
+        "    print([done.value for done in workers.compute([range(3)])])\n"
     )
     environ = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
     command = [sys.executable, str(scripts / "script.py")]
@@ -205,7 +205,7 @@ def executor_of_nobody(**more: Any) -> Any:
     """An executor that has not connected, with a worker that may be given calls."""
     executor = object.__new__(DaskExecutor)
     vars(executor).update(
-        where="here", stats=WorkerStats(), _fit=frozenset({"tcp://here"}), _refused={}, _sending=None,
+        description="here", stats=WorkerStats(), _fit=frozenset({"tcp://here"}), _refused={}, _sending=None,
         _tell=lambda text: None, _contents={}, _plugin_name="files", **more,
     )  # fmt: skip
     return executor

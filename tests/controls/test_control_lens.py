@@ -34,7 +34,7 @@ def random_picture(height: int, width: int) -> Tensor:
 
 @pytest.mark.parametrize("dots", [1, 4, 64])
 def test_the_start_is_the_picture_as_it_is_and_opacity_has_a_slope_there(scene: SceneDescription, dots: int) -> None:
-    bound = LensControl(n_dots=dots).bind(scene)
+    bound = LensControl(dots=dots).bind(scene)
     image = 0.7 + 0.3 * random_picture(24, 32)
     u = bound.start.clone().requires_grad_()
     seen = bound.apply_to_image(u, image)
@@ -120,7 +120,7 @@ def test_the_places_of_the_dots_keep_to_a_range_that_is_given(scene: SceneDescri
 
 
 def test_what_comes_out(scene: SceneDescription) -> None:
-    bound = LensControl(n_dots=2).bind(scene)
+    bound = LensControl(dots=2).bind(scene)
     said = bound.describe(bound.start)
     assert said["lens.radius.1"] == {"value": pytest.approx(0.12), "unit": "picture sizes"} and len(said) == 14
     for shade in (0.0, 1.0):
@@ -136,7 +136,7 @@ def test_what_comes_out(scene: SceneDescription) -> None:
 @pytest.mark.parametrize("dots", [0, 65, 2.5, True, "four", math.nan, math.inf])
 def test_a_number_of_dots_that_is_none_is_refused(dots: object) -> None:
     with pytest.raises(InputError, match=r"lens.dots: expected a whole number from 1 to 64, got"):
-        LensControl(n_dots=dots)
+        LensControl(dots=dots)
 
 
 def test_other_bad_settings_are_refused() -> None:

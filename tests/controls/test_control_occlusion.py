@@ -196,7 +196,7 @@ def test_it_follows_the_camera_and_the_pose_whatever_the_order(scene: SceneDescr
     forward = inputs["camera.to_world"][:3, 2]
     assert float(seat @ forward) / float(seat.norm()) > 0.9
     assert space.describe(u)["occlusion.hidden"]["value"] == pytest.approx(0.4, abs=ACCURACY)
-    unmoved = space.controls[0].placement(space.controls[0].values(u[:1]), {})  # type: ignore[attr-defined]
+    unmoved = space.controls[0].find_placement(space.controls[0].values(u[:1]), {})  # type: ignore[attr-defined]
     assert abs(unmoved.distance - float(space.describe(u)["occlusion.true_distance"]["value"])) > 1e-3
 
 

@@ -21,6 +21,7 @@ from advsearch.controls.ranges import DistributionRange
 from advsearch.distributions import distribution_to_setting
 from advsearch.engine.loading import controls_to_settings, list_session_only_controls, load_scene, make_controls
 from advsearch.errors import InputError
+from advsearch.questions.attack.carry_out import make_attack_controls
 from advsearch.questions.attack.settings import AttackConfig
 
 MUG = load_scene("mug").description
@@ -112,8 +113,8 @@ def test_an_endless_tail_is_left_out_on_both_sides() -> None:
 
 def test_the_clean_scene_has_its_value_where_the_distribution_has_it() -> None:
     near, far = (CameraControl(azimuth=Normal(at, 5.0)).bind(MUG) for at in (45.0, 200.0))
-    assert float(near.values(near.start)["azimuth"]) == pytest.approx(40.0, abs=1e-3) and not near.moved
-    (moved,) = far.moved  # 32 deviations away: the nearest that is ever drawn, and it is said
+    assert float(near.values(near.start)["azimuth"]) == pytest.approx(40.0, abs=1e-3) and not near.adjusted_defaults
+    (moved,) = far.adjusted_defaults  # 32 deviations away: the nearest that is ever drawn, and it is said
     assert moved.used == pytest.approx(176.2, abs=0.1) == float(far.values(far.start)["azimuth"])
 
 
@@ -182,7 +183,7 @@ def test_a_search_refuses_what_says_how_likely_values_are() -> None:
     given = {"camera": {"azimuth": NORM}}
     config = AttackConfig(object="mug", controls=given)
     with pytest.raises(InputError, match=r"camera.azimuth: .* put it into `over`"):
-        make_controls(config, given, {})
+        make_attack_controls(config, given, {})
     drawn = make_attack_controls(AttackConfig(object="mug", controls={"pose": {}}, over=given), {"pose": {}}, given)[1]
     assert [one.name for one in drawn] == ["camera"]
 

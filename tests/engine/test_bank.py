@@ -52,7 +52,7 @@ def test_conditions_are_stratified_and_numbered() -> None:
 
 def grow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let it compare every six evaluations, and go on growing after each comparison."""
-    for name, value in {"EVERY": 6, "UNSEEN": 2, "SURE": -1e9, "FIRST": 3, "GROWTH": 4}.items():
+    for name, value in {"COMPARISON_INTERVAL": 6, "N_COMPARED": 2, "MIN_STANDARD_ERRORS": -1e9, "INITIAL_CONDITIONS": 3, "DRAWS_PER_CONDITION": 4}.items():
         monkeypatch.setattr(bank, name, value)
     monkeypatch.setattr(acceptance, "CHECK_SPP", 4)
     monkeypatch.setattr(surface_renderer, "find_refusal", lambda renderer, varying: Refusal("matrices are tested"))
@@ -195,7 +195,7 @@ def test_conditions_that_are_all_alike_count_the_same() -> None:
 def test_a_bank_that_teaches_enough_stops_growing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where unseen conditions are no better for the model, there are no more after the first comparison."""
     monkeypatch.setattr(bank, "MIN_STANDARD_ERRORS", 1e9)
-    for limit in ("MARGIN", "BOUND"):  # predictions are good enough
+    for limit in ("MAX_MARGIN_BIAS", "MIN_ALLOWED_LEVELS"):  # predictions are good enough
         monkeypatch.setattr(acceptance, limit, 1e9)
     told = advsearch.attack("mug", **SMALL).summary.transport
     assert told is not None and told.conditions is not None

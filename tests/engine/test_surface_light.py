@@ -44,11 +44,11 @@ def coarse() -> Iterator[None]:
     """Few texels, rays and lights, and a comparison every six evaluations."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(texels, "GROUND_TEXELS", 32)
-        for name, value in {"SIDE": 48, "GATHERED": 64}.items():
+        for name, value in {"OBJECT_TEXELS": 48, "RAYS_PER_TEXEL": 64}.items():
             patched.setattr(arrangement, name, value)
-        for name, count in {"LIGHTS": 3, "EVERY": 6}.items():
+        for name, count in {"N_LIGHTS": 3, "COMPARISON_INTERVAL": 6}.items():
             patched.setattr(surface_light, name, count)
-        for name, number in {"CHECK_SPP": 4, "BOUND": 50.0, "MARGIN": 50.0}.items():
+        for name, number in {"CHECK_SPP": 4, "MIN_ALLOWED_LEVELS": 50.0, "MAX_MARGIN_BIAS": 50.0}.items():
             patched.setattr(acceptance, name, number)
         yield
 

@@ -25,7 +25,7 @@ GRID = {"camera.exposure": [-10, -1, 6], "light.power": "0:6:8"}
 def _paying(monkeypatch: pytest.MonkeyPatch) -> None:
     """A few dozen pictures are enough here, and the first two views of a comparison decide."""
     monkeypatch.setattr(predicting, "MIN_SAVING_FACTOR", 0.2)
-    for name in ("BOUND", "MARGIN"):
+    for name in ("MIN_ALLOWED_LEVELS", "MAX_MARGIN_BIAS"):
         monkeypatch.setattr(acceptance, name, 50.0)
 
 

@@ -38,10 +38,10 @@ KITCHEN_TOO: dict[str, Any] = {"environment.which": ["studio", "kitchen"], "came
 def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[SurfaceRenderer]]:
     """Few texels and rays, which pay at once, and are near enough; those that are made."""
     monkeypatch.setattr(texels, "GROUND_TEXELS", 24)
-    for name, value in {"SIDE": 32, "GATHERED": 48}.items():
+    for name, value in {"OBJECT_TEXELS": 32, "RAYS_PER_TEXEL": 48}.items():
         monkeypatch.setattr(arrangement, name, value)
     monkeypatch.setattr(predicting, "MIN_SAVING_FACTOR", 0.0)
-    for name, number in {"CHECK_SPP": 2, "BOUND": 50.0, "MARGIN": 50.0}.items():
+    for name, number in {"CHECK_SPP": 2, "MIN_ALLOWED_LEVELS": 50.0, "MAX_MARGIN_BIAS": 50.0}.items():
         monkeypatch.setattr(acceptance, name, number)
     made, make = list[SurfaceRenderer](), SurfaceRenderer.__init__
 
@@ -106,12 +106,12 @@ def test_environments_have_one_arrangement(coarse: list[SurfaceRenderer]) -> Non
 class Two:
     """Two workers, which carry out batches in any order, each with scenes of its own."""
 
-    facts = WorkerStats(most=2)
+    stats = WorkerStats(most=2)
 
     def __init__(self, job: Any) -> None:
         self.scenes = [SceneLoader(job), SceneLoader(job)]
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
+    def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         pieces = list(batches)
         random.Random(1).shuffle(pieces)
         for number, items in enumerate(pieces):

@@ -49,11 +49,11 @@ class Disorder:
     seed: int = 0
     lose: int | None = None
     stop: int | None = None
-    facts: WorkerStats | None = field(
+    stats: WorkerStats | None = field(
         default_factory=lambda: WorkerStats(most=2, lost=1, busy=9.0, alive=10.0, retried=3)
     )
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
+    def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         pieces = list(batches)
         random.Random(self.seed).shuffle(pieces)
         for count, items in enumerate(pieces):
@@ -120,14 +120,14 @@ def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path:
 @pytest.mark.medium
 def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: Path) -> None:
     class Two(Disorder):
-        def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
-            for done in super().results(batches):
+        def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
+            for done in super().compute(batches):
                 yield replace(done, machine="ab12" if done.items[0][2].number < 4 else None)
 
     job = load_job(CONFIG)
-    facts = WorkerStats(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
+    stats = WorkerStats(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
     with RunDirectory.create(tmp_path / "run") as run:
-        executor = Two(make_worker_call(SceneLoader(job).load_by_name), facts=facts)
+        executor = Two(make_worker_call(SceneLoader(job).load_by_name), stats=stats)
         result = Sweep(job, run, NullProgress(), executor).execute()
         assert run.store.noted("machines") == {"ab12": {"processor": "another", "LLVM": "19.1"}}
     assert [row.machine for row in result.rows()] == ["ab12"] * 4 + [None] * 8

@@ -209,7 +209,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few samples: what is measured says little, but it is measured by the same means."""
     for function in (measure_cosines, count_cosine_samples):
         monkeypatch.setattr(planning, function.__name__, partial(function, counts=(2,)))
-    for name, value in {"FACTORS": (1.0, 3.0), "CONVERGED": 2, "AGAIN": 2}.items():
+    for name, value in {"FACTORS": (1.0, 3.0), "CONVERGED_SPP": 2, "CONVERGED_SPP_FACTOR": 2}.items():
         monkeypatch.setattr(planning, name, value)
     monkeypatch.setattr(INTERRUPTS, "count", 0)
     row = {"item": "tracing", "what": "tracing", "time_gain": 2.0, "seconds": 1.0, "safe": True}

@@ -29,8 +29,8 @@ def coarse() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(texels, "GROUND_TEXELS", 32)
         for module, name, value in (
-            (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (acceptance, "CHECK_SPP", 4),
-            (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (boxes, "MAX_PROBED", 20),
+            (arrangement, "OBJECT_TEXELS", 48), (arrangement, "RAYS_PER_TEXEL", 64), (acceptance, "CHECK_SPP", 4),
+            (acceptance, "MIN_ALLOWED_LEVELS", 50.0), (acceptance, "MAX_MARGIN_BIAS", 50.0), (boxes, "MAX_PROBED", 20),
             (predicting, "find_break_even", lambda *_: 1),
         ):  # fmt: skip
             patched.setattr(module, name, value)

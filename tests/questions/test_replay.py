@@ -128,7 +128,7 @@ def test_a_shared_radiance_gives_the_same_picture(attacked: Path, tmp_path: Path
     u = torch.from_numpy(read_configuration(attacked))
     with RunDirectory.create(tmp_path / "run") as run:
         retrials = Retrials(pair, run, NullProgress(), trials=6, seed=0)
-        first, second = (retrials._rendered(one, u, 7) for one in pair)
+        first, second = (retrials._render(one, u, 7) for one in pair)
     assert torch.equal(first, problem.picture(u, 7, 4)) and torch.equal(second, changed.picture(u, 7, 4))
 
 

@@ -181,7 +181,7 @@ SEARCH: dict[str, Any] = {
 @pytest.mark.medium
 def test_a_search_over_light_renders_its_basis_and_its_comparisons(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(searching, "COMPARISON_INTERVAL", 8)
-    for name in ("BOUND", "MARGIN"):
+    for name in ("MIN_ALLOWED_LEVELS", "MAX_MARGIN_BIAS"):
         monkeypatch.setattr(acceptance, name, 50.0)
     found = advsearch.attack("mug", run=None, **SEARCH).summary
     told, renders = found.transport, found.renders

@@ -105,10 +105,11 @@ def test_from_60_m_the_houses_stand_below_the_road() -> None:
     assert below(60.0)
     assert (
         find_valid_range(
-            find_surroundings(street(60.0, 1.6).description), make_camera_view(street(60.0, 1.6).description)
+            find_surroundings(street(60.0, 1.6).description),  # type: ignore[arg-type]
+            make_camera_view(street(60.0, 1.6).description),
         )[0]
         < 20.0
-    )  # type: ignore[arg-type]
+    )
 
 
 def test_along_a_street_it_fits_as_far_as_its_road() -> None:

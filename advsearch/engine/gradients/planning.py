@@ -470,7 +470,7 @@ def _render_with_depth(
     with torch.no_grad(), renderer.scene.limit_depth(depth):
         radiance = renderer.radiance(u, seed, spp)
         displayed = renderer.formation.display(radiance)
-        return _Rendering(radiance, renderer.space.picture(u, displayed))
+        return _Rendering(radiance, renderer.space.apply_to_image(u, displayed))
 
 
 def _compare_depths(

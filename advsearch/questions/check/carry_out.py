@@ -228,18 +228,18 @@ class GradientCheck:
         renderer = problem.renderer
         bench = self._make_bench(part, renderer, problem.compute_loss, problem.spp)
 
-        n_gradients = planning.plan_gradients(renderer.plan)
+        n_gradients = planning.count_plan_gradients(renderer.plan)
         stage_title = f"{title}: comparing ways to differentiate"
         self.progress.stage(stage_title, n_gradients, hint=HINT)
         measure_bench = replace(bench, seed=seeds.stream(config.seed, "measure"))
-        renderer.plan = planning.measured_plan(measure_bench, count_renders=True)
+        renderer.plan = planning.choose_estimators(measure_bench, count_renders=True)
 
         planned_steps = {group.name: group.step for group in renderer.plan.groups}
         rows = list[results.Measured]()
         for row in self._measure_cosines(problem, bench, config.seed, title):
             rows.append(row)
             yield part.make_row(row)
-        renderer.plan, tuned_spp = planning.tuned(renderer.plan, rows)
+        renderer.plan, tuned_spp = planning.choose_steps(renderer.plan, rows)
         spp = tuned_spp or problem.spp
 
         if not config.all:
@@ -251,7 +251,7 @@ class GradientCheck:
         }
         derivatives = gradients.measure_derivatives(
             replace(bench, spp=spp),
-            reference_spp=planning.CONVERGED,
+            reference_spp=planning.CONVERGED_SPP,
             reference_repeats=N_MODEL_SEEDS,
             stage=partial(self._begin_stage, title),
         )
@@ -266,17 +266,19 @@ class GradientCheck:
         """Yield the cosines of gradients with converged ones, by samples per pixel."""
         plan = problem.renderer.plan
         counts = tuple(
-            count for count in (*planning.COUNTS, MAX_SPP) if count >= problem.spp
+            count
+            for count in (*planning.SAMPLE_COUNTS, MAX_SPP)
+            if count >= problem.spp
         )
         counts = counts or (problem.spp,)
         self.progress.stage(
             f"{title}: the model's gradients",
-            planning.cosine_samples(plan, counts=counts),
+            planning.count_cosine_samples(plan, counts=counts),
             hint=f"counted in samples a pixel; {HINT}",
             at_most=True,
         )
         cosine_bench = replace(bench, seed=seed, tick=self.progress.advance)
-        yield from planning.cosines(cosine_bench, counts=counts)
+        yield from planning.measure_cosines(cosine_bench, counts=counts)
 
     def _make_bench(
         self,
@@ -336,9 +338,9 @@ class GradientCheck:
 
         def measure_length() -> results.PathLength:
             title = "finding how many bounces of light matter"
-            max_images = planning.most_pictures(problem)
+            max_images = planning.count_bounce_images(problem)
             self.progress.stage(title, max_images, hint=hint, at_most=True)
-            return planning.bounces_of(problem, config.seed, tick=tick)
+            return planning.measure_problem_bounces(problem, config.seed, tick=tick)
 
         length = self.measurements.get_row(
             f"{part.key} bounces", results.PathLength, measure_length

@@ -99,8 +99,8 @@ class TextureLesson(Lesson):
     def compute_image(self, u: Tensor) -> Tensor:
         """Return the image (H, W, 3) of a texture, with a graph."""
         inputs = self.space.inputs(u)
-        texture_inputs = {name: inputs[name] for name in self.linear.there}
-        image: Tensor = self.linear.shown(
+        texture_inputs = {name: inputs[name] for name in self.linear.linearized_at}
+        image: Tensor = self.linear.predict_image(
             texture_inputs, torch.cat([u, self.conditions])
         )
         return image

@@ -47,10 +47,16 @@ class PhotographPages:
 
         return Photographs()
 
-    def make_page(self, run: Path, name: str, key: str, elsewhere: str | None) -> str:
+    def make_page(
+        self, run: Path, name: str, key: str, other_device_url: str | None
+    ) -> str:
         """Return the page of a run's photographs; arguments as for `make_align_page`."""
         return make_align_page(
-            name, list_renderings(run), self._photographs.agreement(run), key, elsewhere
+            name,
+            list_renderings(run),
+            self._photographs.agreement(run),
+            key,
+            other_device_url,
         )
 
     def read_picture(self, kind: str, run: Path, name: str) -> tuple[str, bytes]:
@@ -72,7 +78,7 @@ class PhotographPages:
         media_type = "image/png" if file.suffix == ".png" else "image/jpeg"
         return media_type, file.read_bytes()
 
-    def take(
+    def store_photograph(
         self,
         run: Path,
         name: str,

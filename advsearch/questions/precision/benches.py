@@ -339,7 +339,9 @@ class PictureBench:
 
     def _picture(self, radiance: Tensor) -> Tensor:
         with torch.no_grad():
-            return self._space.picture(self._u, self._formation.display(radiance))
+            return self._space.apply_to_image(
+                self._u, self._formation.display(radiance)
+            )
 
 
 def get_denoiser(line: str) -> str:

@@ -264,7 +264,7 @@ SLOPE_COLUMNS: Mapping[str, views.Column] = {
     "theory": lambda slope: (
         ""
         if slope.theory is None
-        else f"{slope.theory:.3g}" + " or steeper" * slope.or_steeper
+        else f"{slope.theory:.3g}" + " or steeper" * slope.may_be_steeper
     ),
     "points": "{0.points}",
     "": lambda slope: {
@@ -398,7 +398,9 @@ def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> Result
     columns |= {
         "estimator": "{0.estimator}",
         "samples": "{0.spp}",
-        "error": lambda point: f"{'' if point.known else '< '}{100 * point.rms:.3g} %",
+        "error": lambda point: (
+            f"{'' if point.is_known else '< '}{100 * point.rms:.3g} %"
+        ),
         "95 %": lambda point: (
             "heavy tails" if point.heavy_tailed else _format_interval(point.interval)
         ),

@@ -157,7 +157,7 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
     if kind == MITSUBA_CONTROL:
         return _parse_key_axis(name, values, control)
 
-    declared = [*control.declared({parameter_name: values})]
+    declared = [*control.declare_parameters({parameter_name: values})]
     if instance in instances:
         declared += instances[instance].instance_parameters
     parameters = {parameter.name: parameter for parameter in declared}
@@ -192,7 +192,7 @@ def _parse_key_axis(name: str, values: Any, control: Any) -> Axis:
             f"{where}: expected Mitsuba's name and values, as in "
             f"{MITSUBA_CONTROL}:KEY=FIRST:LAST:COUNT"
         )
-    (parameter,) = control.declared([key])
+    (parameter,) = control.declare_parameters([key])
     return Axis(
         MITSUBA_CONTROL,
         MITSUBA_CONTROL,

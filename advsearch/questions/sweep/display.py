@@ -1017,7 +1017,7 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
 
 
 def _dip_clause(dip: Dip, unit: str) -> str:
-    at_dip = f"{dip.seen[0]} of {dip.seen[1]} at {dip.distance:.3g} {unit}"
+    at_dip = f"{dip.counts[0]} of {dip.counts[1]} at {dip.distance:.3g} {unit}"
     beyond = f"{dip.counts_beyond[0]} of {dip.counts_beyond[1]} beyond it up to {dip.until:.3g} {unit}"
     return f"{at_dip}, {beyond} (p = {dip.p_value:.2g})"
 

@@ -73,7 +73,7 @@ def add_frames(
     paths = next(
         (
             parameter.options
-            for parameter in travelling.own
+            for parameter in travelling.instance_parameters
             if parameter.name == Control.PATH_PARAMETER
         ),
         (),

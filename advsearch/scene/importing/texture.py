@@ -86,7 +86,7 @@ def apply_textures(
     """
     used = _list_used_surfaces(soup, surfaces)
     first = used[0]
-    is_uniform = all(surface.same_maps(first) for surface in used)
+    is_uniform = all(surface.has_same_maps(first) for surface in used)
     has_uniform_factor = bool((soup.colors == soup.colors[0, 0]).all())
     material = index_materials(soup, surfaces)[1]
     is_lit_twice = False
@@ -101,7 +101,7 @@ def apply_textures(
             is_usable = _is_usable(soup, uvs)
             is_lit_twice = is_usable and _is_lit_twice(uvs, first, images)
             if is_usable and not is_lit_twice:
-                return _texture_with_images(soup, uvs, first.with_pictures(images))
+                return _texture_with_images(soup, uvs, first.with_images(images))
     unwrapped_soup = unwrap(soup, material)
     maps = bake(unwrapped_soup.uvs, soup, surfaces)
     reason = (

@@ -143,7 +143,12 @@ def make_ground_texels(
     )
     cells = np.arange(GROUND_TEXELS * GROUND_TEXELS)
     return LitTexels(
-        (grid,), positions, normals, cells, cells, (0, GROUND_TEXELS * GROUND_TEXELS)
+        (grid,),
+        np.asarray(positions, np.float32),
+        normals,
+        cells,
+        cells,
+        (0, GROUND_TEXELS * GROUND_TEXELS),
     )
 
 

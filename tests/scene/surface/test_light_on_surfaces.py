@@ -28,7 +28,7 @@ def coarse() -> Iterator[None]:
     """Few texels and rays, which are quick."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(texels, "GROUND_TEXELS", 32)
-        for name, value in {"SIDE": 48, "GATHERED": 100}.items():
+        for name, value in {"OBJECT_TEXELS": 48, "RAYS_PER_TEXEL": 100}.items():
             patched.setattr(arrangement, name, value)
         yield
 

@@ -50,7 +50,7 @@ class Categories:
         facts = image.facts
         if isinstance(own, tasks.EnsembleTask):
             own = own.tasks[0]
-        labels: tuple[str, ...] = (facts.label or facts.own_label or facts.object,)
+        labels: tuple[str, ...] = (facts.label or facts.object_label or facts.object,)
         right = 0
         if isinstance(own, tasks.ClassTask) and own.labels:
             labels = own.labels
@@ -68,7 +68,9 @@ class Categories:
                 category = (
                     right
                     if is_object
-                    else models.find_label_set(image.label_of(thing), labels).indices[0]
+                    else models.find_label_set(image.get_label(thing), labels).indices[
+                        0
+                    ]
                 )
                 things.append((thing, category))
             except InputError:

@@ -51,7 +51,7 @@ def _rest(charts: Array, points: Array) -> ChartToPoints:
 def _patches(person: Any) -> list[Patch]:
     """Return the patches of a body, with smooth normals across the seams of charts."""
     data = person.data
-    vertices = person.standing.numpy().astype(np.float64)
+    vertices = person.standing_points.numpy().astype(np.float64)
     index = data["index"].astype(np.int64)
     reference = data["mean"][index] * 1e-4 + np.einsum(
         "r,rpc->pc", data["shares"][1, 1, 1, 1], data["basis"][:, index]
