@@ -91,12 +91,12 @@ def apply_textures(
     material = index_materials(soup, surfaces)[1]
     is_lit_twice = False
     if is_uniform and has_uniform_factor:
-        if not first.pictures:
+        if not first.images:
             return _texture_plain(soup, first, material)
         is_untinted = first.texture is None or soup.colors.min() == 1.0
         if is_untinted and np.isfinite(soup.uvs).all():
             uvs, images = _crop_to_window(
-                _move_into_unit_square(soup), first.pictures, first.texture
+                _move_into_unit_square(soup), first.images, first.texture
             )
             is_usable = _is_usable(soup, uvs)
             is_lit_twice = is_usable and _is_lit_twice(uvs, first, images)
