@@ -1,5 +1,5 @@
-"""Check calls from Python: suggest the keyword that another library's keyword corresponds
-to, and reject wrong types with a sentence.
+"""Check calls from Python: suggest the keyword that another library's keyword
+corresponds to, and reject wrong types with a sentence.
 """
 
 from __future__ import annotations

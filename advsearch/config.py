@@ -55,7 +55,8 @@ def read_named(value: Any, setting: str, default_name: str) -> Any:
 
 
 def read_joined(value: Any, setting: str, default_name: str) -> Any:
-    """Read one name with options as `read_named`, or several joined with + or in a list.
+    """Read one name with options as `read_named`, or several joined with + or in a
+    list.
 
     Several become their names with + between them, and under each name its options:
     ``{"name": "detection+depth", "detection": {"iou": 0.7}}``.
@@ -551,7 +552,9 @@ class SceneConfig(Config):
 
 
 def make_single_value_error(name: str, names: Sequence[str]) -> InputError:
-    """Return the error for several objects, environments or models where one is expected."""
+    """Return the error for several objects, environments or models where one is
+    expected.
+    """
     listed = written.format_value(",".join(names))
     return InputError(
         f"{name}: expected one {name}, got {listed}; give one, or "

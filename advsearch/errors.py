@@ -2,9 +2,9 @@
 
 Every message says what was expected, what was got and what to do, and names the file or
 the setting as Python has it: ``epsilon: ...`` at its beginning, and in backticks
-elsewhere, as in "use `denoise=none`" or "`grid` pose.yaw". The command line writes flags
-instead (`cli.flags.with_flags`) in one line on standard error, with exit status 2;
-anything but an `AdvsearchError` is a bug and keeps its traceback.
+elsewhere, as in "use `denoise=none`" or "`grid` pose.yaw". The command line writes
+flags instead (`cli.flags.with_flags`) in one line on standard error, with exit status
+2; anything but an `AdvsearchError` is a bug and keeps its traceback.
 """
 
 from __future__ import annotations

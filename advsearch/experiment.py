@@ -114,8 +114,8 @@ class RunContext(ExitStack, Generic[Settings]):
             self.ending = INTERRUPTED
 
     def run_part(self, name: str, config: Config) -> Result:
-        """Run an experiment in its own directory within this run, or read its result if it has
-        ended.
+        """Run an experiment in its own directory within this run, or read its result if
+        it has ended.
         """
         return run_part(
             RunDirectory.locate_part(self.run.path, name), config, self.progress
@@ -412,7 +412,9 @@ class Experiment(Generic[AnyResult]):
         return inspect.Signature(parameters, return_annotation=self.result.__name__)
 
     def _find_python_arguments(self) -> dict[str, inspect.Parameter]:
-        """Return the parameters by name that Python callers may pass next to settings."""
+        """Return the parameters by name that Python callers may pass next to
+        settings.
+        """
         if not self.python_arguments:
             return {}
         function = registry.load_attribute(self.python_arguments)

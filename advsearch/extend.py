@@ -1,5 +1,5 @@
-"""Names that an added experiment, control, task, policy, model source, reader or exporter
-may import from advsearch.
+"""Names that an added experiment, control, task, policy, model source, reader or
+exporter may import from advsearch.
 
     from advsearch.extend import Control, Parameter, Values
 

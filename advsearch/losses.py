@@ -79,7 +79,8 @@ def targeted_carlini_wagner(
 def cross_entropy(logits: Tensor, labels: Labels) -> Tensor:
     """Return minus the logarithm of the probability of the right labels, (N,), in nats.
 
-    It is that of torch for one right label, but with a gradient where the model is sure.
+    It is that of torch for one right label, but with a gradient where the model is
+    sure.
     """
     return _by_label(of_logits.cross_entropy, logits, labels)
 
@@ -120,7 +121,8 @@ def targeted_dlr(logits: Tensor, target: Labels) -> Tensor:
 
 
 def total_variation(colors: Tensor) -> Tensor:
-    """Return the mean step from a pixel to its right and lower neighbors, (N,), in sRGB.
+    """Return the mean step from a pixel to its right and lower neighbors, (N,), in
+    sRGB.
 
     After Sharif et al. 2016, section 5.2.2, whose sum over pixels is a mean here, so
     that a weight means the same at every resolution.
@@ -193,7 +195,9 @@ def check_direction(objective: object, *, targeted: bool) -> None:
 
 
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
-    """Return a loss (N,) of logits (N, C) and their labels, of which one may serve all."""
+    """Return a loss (N,) of logits (N, C) and their labels, of which one may serve
+    all.
+    """
     if not isinstance(labels, (Tensor, Sequence)):
         raise InputError(
             "labels: expected (N,) int64 or the indices of a label set, got "

@@ -80,7 +80,8 @@ def load_model(
     labels: Any = None,
     **options: Any,
 ) -> models.Model:
-    """Convert a model of MAITE, an image classifier or an object detector, to a `Model`.
+    """Convert a model of MAITE, an image classifier or an object detector, to a
+    `Model`.
 
     It is called with a list of images (3, H, W), float32 tensors. MAITE does not state
     the size and the range of values that a model takes: give `input_size` and

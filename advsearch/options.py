@@ -52,7 +52,8 @@ def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
     grouped = plain.get(MITSUBA_CONTROL) or {}
     if not isinstance(grouped, Mapping) or grouped.keys() & ranges.keys():
         raise InputError(
-            f"`controls` {MITSUBA_CONTROL}: expected each of Mitsuba's names once, with a range"
+            f"`controls` {MITSUBA_CONTROL}: expected each of Mitsuba's names once, "
+            "with a range"
         )
     return {**plain, MITSUBA_CONTROL: {**grouped, **ranges}}
 
@@ -71,8 +72,8 @@ def _with_parameter(name: str, options: object) -> object:
 
 
 def format_things(things: object) -> str | None:
-    """Return things in a scene as the text that settings have: ``car@12,3.5,heading=180;
-    person@6,-2``.
+    """Return things in a scene as the text that settings have:
+    ``car@12,3.5,heading=180; person@6,-2``.
 
     Files are named by their absolute paths, so that a run may be resumed anywhere.
 
@@ -200,8 +201,8 @@ def _to_json(value: object) -> JsonValue:
 
 
 def to_setting(entry: Any) -> str | dict[str, JsonValue]:
-    """Return a policy or a task as a setting in a file: its name, with the options that differ
-    from their defaults.
+    """Return a policy or a task as a setting in a file: its name, with the options that
+    differ from their defaults.
 
     Options that are no JSON values are left out.
     """
@@ -287,7 +288,9 @@ OUTCOME = "outcome"  # under which a payload has the value of one
 
 
 def get_outcome(payload: object) -> Outcome | None:
-    """Return the outcome that the payload of a prediction states; None if it states none."""
+    """Return the outcome that the payload of a prediction states; None if it states
+    none.
+    """
     value = payload.get(OUTCOME) if isinstance(payload, Mapping) else None
     try:
         return Outcome(value)
@@ -296,8 +299,8 @@ def get_outcome(payload: object) -> Outcome | None:
 
 
 def count_outcomes(payloads: Iterable[object]) -> dict[str, int] | None:
-    """Count the outcomes of predictions that are not right, by value; None if no payload states
-    one.
+    """Count the outcomes of predictions that are not right, by value; None if no
+    payload states one.
     """
     counts = Counter(get_outcome(payload) for payload in payloads)
     named = {outcome.value: counts[outcome] for outcome in Outcome if counts[outcome]}

@@ -1,4 +1,5 @@
-"""Registries: built-in and installed parts of one kind by their name on the command line.
+"""Registries: built-in and installed parts of one kind by their name on the command
+line.
 
 A package adds to a registry through an entry point of the registry's group, as
 `docs/extending.md` shows.
@@ -47,8 +48,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """Return an entry.
 
         Raises:
-            InputError: the class that a name is cannot be imported, is something else, or must
-                not be imported (`check_import`).
+            InputError: the class that a name is cannot be imported, is something else,
+                or must not be imported (`check_import`).
         """
         if not self.names_class(name):
             if name not in self.built_ins:
@@ -72,7 +73,9 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return entry
 
     def __contains__(self, name: object) -> bool:
-        """Whether there is an entry. It is imported only if its name is that of a class."""
+        """Whether there is an entry. It is imported only if its name is that of a
+        class.
+        """
         if not isinstance(name, str):
             return False
         if self.names_class(name):
@@ -87,8 +90,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return sum(1 for _ in self)
 
     def get_help(self, name: str) -> str:
-        """Return a sentence about an entry: of the catalog, or the first line of its docstring; if
-        it cannot be imported, why.
+        """Return a sentence about an entry: of the catalog, or the first line of its
+        docstring; if it cannot be imported, why.
         """
         entry = self.built_ins.get(name)
         if isinstance(entry, BuiltIn):
@@ -141,7 +144,9 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
 
 
 def get_first_doc_line(entry: Any) -> str:
-    """Return the summary of an object's docstring, on one line; empty for plain values."""
+    """Return the summary of an object's docstring, on one line; empty for plain
+    values.
+    """
     is_documented = inspect.isroutine(entry) or inspect.isclass(entry)
     documented = entry if is_documented else type(entry)
     if documented.__module__ == "builtins":

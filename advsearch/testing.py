@@ -123,7 +123,8 @@ def assert_no_worse(
 
 
 def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
-    """Assert that all claims of a suite hold, or are as expected when it was last updated.
+    """Assert that all claims of a suite hold, or are as expected when it was last
+    updated.
 
     Args:
         suite: a YAML file.

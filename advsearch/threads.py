@@ -88,8 +88,8 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(for_torch)
     else:
-        # read when torch is imported later; not otherwise, because child processes would
-        # inherit it
+        # read when torch is imported later; not otherwise, because child processes
+        # would inherit it
         os.environ["OMP_NUM_THREADS"] = str(for_torch)
     if "drjit" in sys.modules:
         apply_to_drjit()

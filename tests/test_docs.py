@@ -43,7 +43,7 @@ from advsearch.questions.harden.result import ALL_OBJECTS, HardenConfig
 from advsearch.questions.recipe.description import list_recipes as recipes
 from advsearch.questions.recipe.description import plan_runs, read_recipe
 from advsearch.questions.recipe.result import RecipeConfig
-from advsearch.questions.replay.result import WAYS, ReplayConfig
+from advsearch.questions.replay.result import RENDER_METHODS, ReplayConfig
 from advsearch.questions.stability.result import StabilityConfig
 from advsearch.questions.stability.scenes import select_cases
 from advsearch.questions.sweep.axes import parse_axes
@@ -144,7 +144,7 @@ def check_names(config: Config) -> None:
         assert config.suite
         return
     if isinstance(config, ReplayConfig):
-        assert set(config.selected_names) <= set(WAYS)
+        assert set(config.selected_names) <= set(RENDER_METHODS)
         return
     if isinstance(config, RecipeConfig):
         assert config.recipe in ("list", "mine.yaml") or plan_runs(read_recipe(config.recipe), config)

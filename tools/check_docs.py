@@ -476,7 +476,8 @@ MADE_BY_HAND = [
     ),
     (
         "design.md",
-        f"carry at most {100 * trials.MAX_MOVED_FRACTION:.0f} % of the conditions over zero",
+        f"carry at most {100 * trials.MAX_MOVED_FRACTION:.0f} % of the conditions over "
+        "zero",
     ),
     ("runs.md", {1.0: "may lose the rows of the last second"}[store.SYNC_INTERVAL]),
     ("runs.md", f"more than {100 * store.SYNC_SHARE:.0f} % of the time"),
@@ -489,9 +490,9 @@ MADE_BY_HAND = [
     ("policies/pgd.md", f"the first after {100 * pgd.FIRST_WINDOW:.0f} % of the steps"),
     (
         "policies/pgd.md",
-        {0.75: "fewer than three quarters of the steps"}[pgd.IMPROVING],
+        {0.75: "fewer than three quarters of the steps"}[pgd.MIN_IMPROVING_FRACTION],
     ),
-    ("policies/pgd.md", {5: "Five in a row end the search"}[pgd.PATIENCE]),
+    ("policies/pgd.md", {5: "Five in a row end the search"}[pgd.MAX_FLAT_GRADIENTS]),
     (
         "reference-model.md",
         {0.25: "A quarter of the pictures is not denoised"}[reference_scenes.RAW_SHARE],

@@ -35,7 +35,9 @@ VAGUE_PARTS = frozenset(
     "".split()
 )
 ALLOWED = frozenset[str]()
-"""Names with a vague part that users type, that files store, or that a library asks for."""
+"""Names with a vague part that users type, that files store, or that a library asks
+for.
+"""
 MAX_LOCALS = 14
 WORDS = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|_")
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -129,7 +131,9 @@ def check_tree(node: ast.AST, path: str, scope: str = "") -> Iterator[Finding]:
 
 
 def find_all(package: Path) -> list[Finding]:
-    """Return the findings of all files of a package, in the order of files and lines."""
+    """Return the findings of all files of a package, in the order of files and
+    lines.
+    """
     findings: list[Finding] = []
     for path in sorted(package.rglob("*.py")):
         relative = path.relative_to(package.parent).as_posix()

@@ -122,7 +122,8 @@ FAULTS = (
     Fault(
         "controls: the exposure counts twice",
         "advsearch/controls/camera.py",
-        'values["exposure"] - scene.number(\n                "camera.exposure"\n            )',
+        'values["exposure"] - scene.number(\n                "camera.exposure"\n       '
+        "     )",
         'values["exposure"]',
         ("tests/controls/test_clean.py",),
     ),
@@ -172,7 +173,8 @@ FAULTS = (
     Fault(
         "attacks: a projection is left out",
         "advsearch/attacks/domain.py",
-        "project_l2_box(\n                    u[part], self.start[part], block.epsilon, block.low, block.high\n                )",
+        "project_l2_box(\n                    u[part], self.start[part], "
+        "block.epsilon, block.low, block.high\n                )",
         "u[part].clamp(block.low, block.high)",
         ("tests/attacks/test_attacks_domain.py",),
     ),
@@ -256,7 +258,8 @@ FAULTS = (
     Fault(
         "report: the bleed is printed as a part of the size",
         "advsearch/report/sheets.py",
-        "(width - 2 * self.bleed[0]) * self.pixel[0], (\n            height - 2 * self.bleed[1]\n        ) * self.pixel[1]",
+        "(width - 2 * self.bleed[0]) * self.pixel[0], (\n            height - 2 * "
+        "self.bleed[1]\n        ) * self.pixel[1]",
         "width * self.pixel[0], height * self.pixel[1]",
         ("tests/report/test_sheets.py",),
     ),
@@ -327,8 +330,10 @@ FAULTS = (
     Fault(
         "recipes: right and wrong are mixed up",
         "advsearch/questions/recipe/rates.py",
-        "for rendering_is_right in (True, False):\n        for other_is_right in (True, False):",
-        "for other_is_right in (True, False):\n        for rendering_is_right in (True, False):",
+        "for rendering_is_right in (True, False):\n        for other_is_right in "
+        "(True, False):",
+        "for other_is_right in (True, False):\n        for rendering_is_right in "
+        "(True, False):",
         ("tests/questions/test_recipe.py",),
     ),
     Fault(
@@ -440,8 +445,8 @@ def found_by(
     Args:
         root: the copy.
         fault: what is planted.
-        failing: tests that fail without a fault too, and find nothing; those that are met
-            are added.
+        failing: tests that fail without a fault too, and find nothing; those that are
+            met are added.
         all_tests: run all tests where those of the fault do not find it.
     """
     for tests in (fault.tests, ("tests",)) if all_tests else (fault.tests,):

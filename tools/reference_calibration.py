@@ -45,9 +45,8 @@ class Report:
         per_class: accuracy per class; None for a class without images.
         confusion: (classes, classes) counts, rows are the true class.
         confidence: mean of the largest probability.
-        error: expected calibration error: mean over images of |accuracy - confidence| of
-            their bin (Guo et al.
-            2017, eq. 3).
+        error: expected calibration error: mean over images of |accuracy - confidence|
+            of their bin (Guo et al. 2017, eq. 3).
         log_loss: mean negative log-probability of the true class, in nats.
         bins: the reliability diagram.
     """
@@ -103,8 +102,8 @@ def evaluate(
     """Return the figures of a model on images.
 
     Args:
-        model: a `Model`, or any function from images (n, H, W, 3) in [0, 1] to logits (n,
-            classes).
+        model: a `Model`, or any function from images (n, H, W, 3) in [0, 1] to logits
+            (n, classes).
         images: (N, H, W, 3), uint8.
         labels: N class indices.
         batch_size: images at once.

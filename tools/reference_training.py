@@ -65,16 +65,18 @@ def train(
     weights of the same quality.
 
     Args:
-        images: (N, H, W, 3), uint8, display-referred; a tensor, an array or a memory map.
+        images: (N, H, W, 3), uint8, display-referred; a tensor, an array or a memory
+            map.
         labels: N class indices.
         classes: number of classes.
         epochs: passes over the images.
-        batch_size: images a step; a remainder smaller than that is left out of its epoch.
+        batch_size: images a step; a remainder smaller than that is left out of its
+            epoch.
         lr: the highest learning rate.
         seed: at least 0.
         augmentation: default `Augmentation()`.
-        average_decay: weight of the past in the moving average, per step; less in the first
-            steps.
+        average_decay: weight of the past in the moving average, per step; less in the
+            first steps.
         bfloat16: run convolutions in bfloat16, weights stay in float32. About 1.5 times
             faster on processors with it.
         progress: called after every step.
@@ -270,11 +272,12 @@ def save(
     two paths.
 
     Args:
-        folder: made if it is not there; that of the package is `reference.data_folder()`.
+        folder: made if it is not there; that of the package is
+            `reference.data_folder()`.
         state: the state dict of a `ReferenceNet` for ``len(labels)`` classes.
         labels: the label names in index order.
-        figures: what is known of it (accuracy, calibration, seed, ...), kept in the record
-            as it is.
+        figures: what is known of it (accuracy, calibration, seed, ...), kept in the
+            record as it is.
     """
     net = build(len(labels))
     net.load_state_dict(dict(state))

@@ -35,7 +35,9 @@ COLUMNS = 9
 PITCH = 15.0
 PATCH_SIZE = 12.0
 CORNER_SIZE = 9.0
-"""Patches in a row; their pitch, their size and that of a black square in millimetres."""
+"""Patches in a row; their pitch, their size and that of a black square in
+millimetres.
+"""
 ROWS = -(-len(CHART_COLORS) // COLUMNS)
 # Width and height of all patches with the paper around them, in millimetres.
 CHART_SIZE = (COLUMNS * PITCH, ROWS * PITCH)
@@ -140,7 +142,8 @@ def _make_pairs(values: Iterable[float]) -> Floats:
 
 
 def _find_corners(light: Floats, photograph: str | Path) -> Floats:
-    """Find the centers (4, 2) of the black squares, x and y in pixels, in reading order.
+    """Find the centers (4, 2) of the black squares, x and y in pixels, in reading
+    order.
 
     They are the outermost of all dark, filled squares.
 

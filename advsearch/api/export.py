@@ -58,7 +58,8 @@ class AdversarialRun:
 
     @classmethod
     def load(cls, run: str | Path) -> AdversarialRun:
-        """Load the adversarial scene of a finished run of `attack`, by its name or folder.
+        """Load the adversarial scene of a finished run of `attack`, by its name or
+        folder.
 
         Raises:
             InputError: it has none, or its scene has changed.
@@ -86,14 +87,16 @@ class AdversarialRun:
         )
 
     def split_inputs(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Return the inputs of the scene inside Mitsuba, and those applied to its image."""
+        """Return the inputs of the scene inside Mitsuba, and those applied to its
+        image.
+        """
         inputs = self.inputs
         on_image = {name: inputs.pop(name) for name in IMAGE_INPUTS if name in inputs}
         return inputs, on_image
 
     def posed_object(self) -> tuple[MeshPart, Shape]:
-        """Return the object as the scene describes it, and as it is in the scene: displaced, in its
-        pose, with its texture.
+        """Return the object as the scene describes it, and as it is in the scene:
+        displaced, in its pose, with its texture.
         """
         description = self.problem.space.scene
         assert description is not None
@@ -101,7 +104,9 @@ class AdversarialRun:
         return part, pose_mesh(part, self.inputs)
 
     def render(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Render the scene with some inputs as the run does: an image (H, W, 3), sRGB in [0, 1]."""
+        """Render the scene with some inputs as the run does: an image (H, W, 3), sRGB
+        in [0, 1].
+        """
         renderer = self.problem.renderer
         traced = {
             name: value for name, value in inputs.items() if name not in IMAGE_INPUTS
@@ -133,8 +138,8 @@ class AdversarialRun:
 
 BLEED = 3.0  # color beyond the line to cut, in millimetres
 MAX_PIXEL_SIZE = 0.2
-"""Maximum size of a printed pixel in millimetres: larger texels are subdivided, with the
-renderer's interpolation.
+"""Maximum size of a printed pixel in millimetres: larger texels are subdivided, with
+the renderer's interpolation.
 """
 # Maximum subdivisions of a texel per axis; odd, so that the center has its own color.
 MAX_SUBDIVISIONS = 9
@@ -142,8 +147,8 @@ MAX_OBJECT_SIZE = 100_000.0  # maximum size of a printed object in millimetres
 
 
 def get_real_size(run: str | Path) -> float | None:
-    """Return the size of the object of a run of `attack`, its longest side in millimetres; None
-    if it is unknown.
+    """Return the size of the object of a run of `attack`, its longest side in
+    millimetres; None if it is unknown.
     """
     folder = find_run(run)
     load_attack_summary(folder)  # refuses others

@@ -2,8 +2,8 @@
 
 A setting is declared once: its default, its range, its description. In Python it may
 take more than the text of a file (`make_hint`). Signatures and docstrings are made from
-both (`with_settings_signature`). Type checkers see the keywords of `attack` and `sweep` in code:
-`SceneKeywords` and its subclasses.
+both (`with_settings_signature`). Type checkers see the keywords of `attack` and `sweep`
+in code: `SceneKeywords` and its subclasses.
 """
 
 from __future__ import annotations
@@ -123,7 +123,8 @@ ConfigType = TypeVar("ConfigType", bound=Config)
 
 
 def with_settings_signature(config: type[Config]) -> Callable[[Function], Function]:
-    """Give a function that takes settings as `**settings` their signature and docstring.
+    """Give a function that takes settings as `**settings` their signature and
+    docstring.
 
     Every setting becomes a keyword with its declared default, and a line among the
     arguments. A setting that is a parameter of the function already stays as it is.
@@ -285,14 +286,18 @@ def _make_docstring(
     """Complete the docstring of an experiment's function.
 
     Args:
-        text: its own docstring: what it does, and arguments that `SHARED_ARGUMENTS` does not have.
+        text: its own docstring: what it does, and arguments that `SHARED_ARGUMENTS`
+            does not have.
         names: of its own arguments.
         command: of the experiment.
         settings: a line for each setting.
     """
     summary, _, own_arguments = inspect.cleandoc(text).partition("\n\nArgs:\n")
     if "other arguments are the settings of" not in " ".join(summary.split()):
-        summary += f"\n\nAll other arguments are the settings of `advsearch {command}`. {RUN_STORED}"
+        summary += (
+            "\n\nAll other arguments are the settings of `advsearch "
+            f"{command}`. {RUN_STORED}"
+        )
     described = {
         entry.partition(":")[0]: entry.rstrip()
         for entry in re.split(r"(?m)^(?=\w+: )", textwrap.dedent(own_arguments))

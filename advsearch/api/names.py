@@ -1,4 +1,5 @@
-"""Look up names in settings before PyTorch and Mitsuba are imported, which takes seconds.
+"""Look up names in settings before PyTorch and Mitsuba are imported, which takes
+seconds.
 
 So a typing error is reported at once. Names that pass are looked up again by what loads
 them.

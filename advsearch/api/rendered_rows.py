@@ -75,8 +75,8 @@ class RenderedRow:
 
 
 def render_rows(run: str, *, every: bool, progress: Progress) -> Iterator[RenderedRow]:
-    """Render the images of a run of `sweep` or `attack`, or of one with such parts (a suite, a
-    study).
+    """Render the images of a run of `sweep` or `attack`, or of one with such parts (a
+    suite, a study).
 
     Args:
         run: its name or folder.
@@ -101,7 +101,8 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
     command = str(read_yaml(folder / CONFIG).get("command"))
     if command not in RENDERERS:
         raise InputError(
-            f"{folder}: expected a run of {' or '.join(RENDERERS)}, or one with such parts, "
+            f"{folder}: expected a run of {' or '.join(RENDERERS)}, or one with such "
+            "parts, "
             f"got one of {command}"
         )
     missing = [
@@ -178,8 +179,8 @@ def _read_sweep_rows(folder: Path, n_models: int) -> dict[int, list[Row]]:
 def _render_attack(
     folder: Path, every: bool, progress: Progress
 ) -> Iterator[RenderedRow]:
-    """Render the trials of an attack's adversarial scene and of the clean one; the first
-    of each if no condition varies.
+    """Render the trials of an attack's adversarial scene and of the clean one; the
+    first of each if no condition varies.
     """
     summary = load_attack_summary(folder)
     parts = load_parts_of_run(folder)

@@ -166,10 +166,10 @@ N_BETS = 8
 class FailureRate:
     """The share of configurations, drawn evenly from the budget, in which one render of
     the search is a success: the mean of the weighted draws (None where `effective` is
-    under `MIN_EFFECTIVE_FAILURES`, or a draw could not be evaluated); an interval that covers
-    the share in 95 % at least, however the draws were adapted, at any number of them;
-    and how many failures of equal weight would be worth as much: (sum w)^2 / sum w^2
-    (Kish 1965).
+    under `MIN_EFFECTIVE_FAILURES`, or a draw could not be evaluated); an interval that
+    covers the share in 95 % at least, however the draws were adapted, at any number of
+    them; and how many failures of equal weight would be worth as much: (sum w)^2 / sum
+    w^2 (Kish 1965).
     """
 
     estimate: float | None

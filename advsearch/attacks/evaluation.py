@@ -214,9 +214,9 @@ class Proposal:
         )
 
     def limit_cost(self, domain: Domain, renders_left: int) -> Proposal:
-        """Return the proposal as far as `renders_left` renders, at least 1, allow: no more
-        samples than these, and no gradient after which no render would be left to use
-        it.
+        """Return the proposal as far as `renders_left` renders, at least 1, allow: no
+        more samples than these, and no gradient after which no render would be left to
+        use it.
         """
         proposal = (
             replace(self, samples=renders_left) if self.samples > renders_left else self
@@ -229,8 +229,8 @@ class Proposal:
 @dataclass(frozen=True)
 class Counts:
     """What a policy had to do about evaluations, for the summary of a run: gradients of
-    which single numbers were outliers and cut (`pgd.clip_gradient`), those shortened as a
-    whole, and steps that were taken back (`rejected`).
+    which single numbers were outliers and cut (`pgd.clip_gradient`), those shortened as
+    a whole, and steps that were taken back (`rejected`).
     """
 
     cut: int = 0

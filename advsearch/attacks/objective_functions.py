@@ -84,8 +84,8 @@ def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
 
     -log p = softplus(l) with l the `log_odds`: that form neither overflows for logits
     of thousands nor cancels where p is near 1. Its slope in l is 1 - p and would be
-    lost where the model is sure. So below l = `MAX_LOG_ODDS`, where the value is 3e-7, it
-    is continued by its tangent: the slope stays 3e-7, and values get slightly under
+    lost where the model is sure. So below l = `MAX_LOG_ODDS`, where the value is 3e-7,
+    it is continued by its tangent: the slope stays 3e-7, and values get slightly under
     0. That is enough for policies that normalise their steps; `log_odds` has slope 1
     everywhere.
     """

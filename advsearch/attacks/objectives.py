@@ -55,8 +55,8 @@ alone.
 IMAGE_PARAMETERS = ("images", "image")
 
 ReadInput = Callable[[str], Any]
-"""Gives what is asked for by one of the names in `REQUESTABLE_INPUTS`, at the configuration of each
-picture.
+"""Gives what is asked for by one of the names in `REQUESTABLE_INPUTS`, at the
+configuration of each picture.
 """
 
 
@@ -143,9 +143,11 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
         signature.bind(*([None] * n_positional), **dict.fromkeys(requested_inputs))
     except TypeError as error:
         raise InputError(
-            f"objective {get_name(function)!r}: expected a function that takes (output, "
+            f"objective {get_name(function)!r}: expected a function that takes "
+            "(output, "
             "images, truth) or (output, "
-            f"labels), and beside them any of {', '.join(REQUESTABLE_INPUTS)} by name: {error}"
+            f"labels), and beside them any of {', '.join(REQUESTABLE_INPUTS)} by name: "
+            f"{error}"
         ) from None
     return ObjectiveSignature(takes_images, requested_inputs)
 
@@ -228,7 +230,9 @@ def _evaluate_each_image(
 
 
 def _check_keeps_gradient(name: str, values: Tensor, sources: tuple[Any, ...]) -> None:
-    """Raise InputError if a function lost the gradient by its sources, such as images."""
+    """Raise InputError if a function lost the gradient by its sources, such as
+    images.
+    """
     if values.requires_grad or not torch.is_grad_enabled():
         return
     if any(isinstance(source, Tensor) and source.requires_grad for source in sources):

@@ -165,19 +165,20 @@ def search(
             first.
         seed, noise: root seeds of the search's own randomness, and of the renders; at
             least 0.
-        candidates, repeats, max_extra_repeats: see above; they cost at most `candidates * (repeats
+        candidates, repeats, max_extra_repeats: see above; they cost at most `candidates
+            * (repeats
             + close)` renders more.
         on_step: called after every evaluation.
         seconds: end step 1 after the first evaluation that is done later than this,
             over 0; None for no limit. There is always one evaluation, and step 2 comes
             on top. Policies still plan for `steps`.
-        is_out_of_time: says, after so many evaluations, whether the time is over; in place of
-            `seconds`, for a run that goes on.
+        is_out_of_time: says, after so many evaluations, whether the time is over; in
+            place of `seconds`, for a run that goes on.
         kind: of the queries.
 
     Raises:
-        InputError: steps, candidates, repeats, max_extra_repeats or seconds out of range, or the
-            policy cannot search this domain.
+        InputError: steps, candidates, repeats, max_extra_repeats or seconds out of
+            range, or the policy cannot search this domain.
         RuntimeError, ValueError: the policy left the domain or `evaluate` broke its
             contract; a bug.
     """
@@ -189,7 +190,9 @@ def search(
             f"{candidates} and {repeats}"
         )
     if max_extra_repeats < 0:
-        raise InputError(f"max_extra_repeats: expected at least 0, got {max_extra_repeats}")
+        raise InputError(
+            f"max_extra_repeats: expected at least 0, got {max_extra_repeats}"
+        )
     if seconds is not None and not seconds > 0.0:
         raise InputError(f"seconds: expected a number over 0, got {seconds}")
     started = time.perf_counter()
@@ -402,7 +405,9 @@ def _explore(
 def _limit_batch(
     proposals: Sequence[Proposal], domain: Domain, renders_left: int
 ) -> list[Proposal]:
-    """Return copies of the first proposals, as many and as costly as the renders allow."""
+    """Return copies of the first proposals, as many and as costly as the renders
+    allow.
+    """
     batch = list[Proposal]()
     for proposal in proposals:
         if renders_left <= 0:
@@ -485,7 +490,8 @@ def _check_evaluation(
         )
     if not min_cost <= evaluation.cost <= max_cost:
         raise RuntimeError(
-            f"evaluate took {evaluation.cost} renders; expected {min_cost} to {max_cost}, by "
+            f"evaluate took {evaluation.cost} renders; expected {min_cost} to "
+            f"{max_cost}, by "
             "the proposal's samples and the "
             "domain's gradient_cost"
         )

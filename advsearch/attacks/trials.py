@@ -76,9 +76,9 @@ def make_margin_function(
     draws_conditions: bool = False,
 ) -> MarginsOf:
     """Return the margins of one configuration, its scores with their sign turned, under
-    the conditions that the scene comes with, or under those `draws_conditions` by the seeds; the
-    rows of all sample counts are numbered together, and the first `n_images` pictures of
-    each are wanted.
+    the conditions that the scene comes with, or under those `draws_conditions` by the
+    seeds; the rows of all sample counts are numbered together, and the first `n_images`
+    pictures of each are wanted.
     """
     n_rendered = Counter[int]()
 
@@ -385,8 +385,8 @@ def limit_ladder(
 ) -> Sequence[int]:
     """Return the sample counts of a ladder that a check can afford.
 
-    Its images take at most `MAX_SAMPLE_RATIO` the samples of the searches; the first two
-    counts are returned in any case.
+    Its images take at most `MAX_SAMPLE_RATIO` the samples of the searches; the first
+    two counts are returned in any case.
     """
     return [
         spp
@@ -402,9 +402,9 @@ def choose_rate_spp(
     conditions with a margin below zero where it is, of each configuration; return the
     highest rung that one of them needed.
 
-    Each is rendered under the same `N_CONDITIONS` at a rung and at the one below. It has
-    settled where the mean change of the margin, taken once more and at either end of
-    its 95 % interval (Student's t), would carry at most `MAX_MOVED_FRACTION` of the
+    Each is rendered under the same `N_CONDITIONS` at a rung and at the one below. It
+    has settled where the mean change of the margin, taken once more and at either end
+    of its 95 % interval (Student's t), would carry at most `MAX_MOVED_FRACTION` of the
     conditions over zero (`estimate_moved_fraction`). The error that is left falls with
     the sample count, so it is smaller than the change that led here
     (`benchmarks/verdicts.py` has how far the rate is off then). No render of it is a

@@ -432,7 +432,9 @@ def _is_found(
     spp: int,
     is_early: bool,
 ) -> bool:
-    """Return whether enough trials succeed, and the clean configuration is not wrong."""
+    """Return whether enough trials succeed, and the clean configuration is not
+    wrong.
+    """
     clean_looked_at = clean_trials[:count]
     n_needed = rule.count_needed(rule.count_valid(clean_looked_at), early=is_early)
     n_successes = _list_outcomes(rule, trials, clean_trials).count(True)

@@ -280,7 +280,8 @@ def check_llvm() -> Component:
             f"unset {llvm.ENVIRONMENT_VARIABLE}"
             if library_setting
             else (
-                f"{llvm.get_install_command()} (or name a file in {llvm.ENVIRONMENT_VARIABLE})"
+                f"{llvm.get_install_command()} (or name a file in "
+                f"{llvm.ENVIRONMENT_VARIABLE})"
             )
         )
         return Component(

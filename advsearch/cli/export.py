@@ -171,7 +171,9 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
 def _choose_table_format(
     args: argparse.Namespace, out: Path | None, by_name: str
 ) -> str:
-    """Return the format of a table by the name of its file; CSV if that says nothing."""
+    """Return the format of a table by the name of its file; CSV if that says
+    nothing.
+    """
     if by_name in FORMATS:
         return by_name
     return "json" if args.json and out is None else "csv"

@@ -68,7 +68,9 @@ def file(args: argparse.Namespace) -> int:
 
 
 def _mesh_file(file: str, inside: Contents) -> Understood:
-    """Return what the file of a mesh contains, as facts for JSON and as lines of text."""
+    """Return what the file of a mesh contains, as facts for JSON and as lines of
+    text.
+    """
     material_sizes = {
         name: len(faces) for name, faces in inside.object.mesh.materials.items()
     }

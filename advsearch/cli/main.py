@@ -142,7 +142,8 @@ class ExperimentCommand:
         if self.experiment.positional and subject in (None, []):
             command = f"advsearch {self.name}"
             raise InputError(
-                f"{command}: expected {self.experiment.positional.expected}; see {command} --help"
+                f"{command}: expected {self.experiment.positional.expected}; see "
+                f"{command} --help"
             )
         if isinstance(subject, list):
             setattr(args, about, ",".join(subject))
@@ -303,7 +304,7 @@ def get_command_help(name: str) -> str:
 
 _EXAMPLES = """examples:
   advsearch attack --object mug --control texture
-  advsearch attack --object mug.obj --environment room.hdr --model model.pt2 --labels labels.json --label "mug,cup"
+  advsearch attack --object mug.obj --model model.pt2 --labels labels.json --label "mug,cup"
   advsearch run runs/mug-texture-001/run.yaml steps=80
   advsearch show runs/mug-texture-001
 """

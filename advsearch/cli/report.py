@@ -166,7 +166,8 @@ def _take_in(folder: str, name: str) -> None:
             file.name for file in files if not file.stem.startswith("rendering-")
         ]:
             raise InputError(
-                f"photographs: {unnumbered_files[0]}: expected the number of a rendering in its "
+                f"photographs: {unnumbered_files[0]}: expected the number of a "
+                "rendering in its "
                 "name, such as rendering-12.jpg, "
                 f"or {POSES} beside it; advsearch dashboard aligns photographs by phone"
             )
@@ -211,7 +212,8 @@ def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
         if len(steps) != 1:
             pose_text = ", ".join(f"{name} {text}" for name, text in pose.items())
             raise InputError(
-                f"{location}: expected a pose that one rendering of {run.name} has, got "
+                f"{location}: expected a pose that one rendering of {run.name} has, "
+                "got "
                 f"{pose_text}, which {len(steps)} have; "
                 "sweep a grid of the poses"
             )

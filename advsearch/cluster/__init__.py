@@ -1,4 +1,5 @@
-"""Batches of work: in this process (`InProcess`) or by workers (`workers.open_workers`).
+"""Batches of work: in this process (`InProcess`) or by workers
+(`workers.open_workers`).
 
 All kinds of workers have one interface, `concurrent.futures.Executor`: a pure function
 of a module and picklable arguments go in, a future comes out. The result of a batch

@@ -264,7 +264,9 @@ class DaskExecutor(WorkerExecutor):
         self._fit = fit - set(self._refused)
 
     async def _versions(self, workers: list[str]) -> dict[str, Any]:
-        """Return the version of advsearch of each worker, or the error of those that fail."""
+        """Return the version of advsearch of each worker, or the error of those that
+        fail.
+        """
         found: dict[str, Any] = await self._client.run(
             compute_version, workers=workers, on_error="return"
         )
@@ -278,12 +280,15 @@ class DaskExecutor(WorkerExecutor):
             self._tell(f"{address} is given nothing: {reason}")
 
     def _check_hope(self, now: float) -> None:
-        """Raise ClusterError if there has been no worker that suits the task for too long."""
+        """Raise ClusterError if there has been no worker that suits the task for too
+        long.
+        """
         patience = LESS_PATIENCE if self._refused else PATIENCE
         if now - self._alone_since > patience:
             reasons = "; ".join(dict.fromkeys(self._refused.values()))
             raise ClusterError(
-                f"{self.description}: there was no worker that can do it for {patience:.0f} s"
+                f"{self.description}: there was no worker that can do it for "
+                f"{patience:.0f} s"
                 f"{f' ({reasons})' if reasons else ''}; what was stored is kept, so "
                 "that the run can go on with "
                 "advsearch resume"
@@ -318,7 +323,9 @@ class DaskExecutor(WorkerExecutor):
     async def _call(
         self, client: Any, function: Callable[..., Any], args: tuple[Any, ...]
     ) -> Any:
-        """Run a function on a worker; again if its result was lost, or the worker is unfit."""
+        """Run a function on a worker; again if its result was lost, or the worker is
+        unfit.
+        """
         # comes with the extra `dask`
         from distributed import KilledWorker
 
@@ -363,7 +370,9 @@ class DaskExecutor(WorkerExecutor):
         raise BrokenExecutor(f"{self.description}: the scheduler has gone")
 
     async def _wait(self, future: Any, workers: list[str]) -> tuple[str, Any] | None:
-        """Return what a future ends with, None if none of its allowed workers is left."""
+        """Return what a future ends with, None if none of its allowed workers is
+        left.
+        """
 
         async def fetch() -> tuple[str, Any]:
             result: tuple[str, Any] = await future
@@ -379,7 +388,9 @@ class DaskExecutor(WorkerExecutor):
             fetching.cancel()
 
     async def _is_refused(self, client: Any, address: str, value: Any) -> bool:
-        """Return whether another worker has to run the call, or this one with files sent to it."""
+        """Return whether another worker has to run the call, or this one with files
+        sent to it.
+        """
         failure = value.failure if isinstance(value, Reply) else None
         if failure is Failure.MISSING_FILES and (
             self._sending is None or not self._sending.done()
@@ -457,7 +468,9 @@ def open_dask(
 
 
 def parse_site(workers: int | None, cluster: str) -> ClusterSite:
-    """Parse the address of a scheduler, or a YAML file, and how many workers it needs."""
+    """Parse the address of a scheduler, or a YAML file, and how many workers it
+    needs.
+    """
     if cluster.startswith(ADDRESS_SCHEMES):
         site = ClusterSite(cluster, address=cluster)
     elif cluster.endswith((".yaml", ".yml")):

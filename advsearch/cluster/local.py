@@ -78,7 +78,9 @@ class WorkerProcess:
 
 
 class LocalExecutor(WorkerExecutor):
-    """An executor of processes, each started when it is needed, and replaced if it dies."""
+    """An executor of processes, each started when it is needed, and replaced if it
+    dies.
+    """
 
     def __init__(self, count: int) -> None:
         if SERVE_VARIABLE in os.environ:

@@ -90,7 +90,9 @@ REFERRED_SUFFIXES = {
     ".gltf": (".bin",),
     ".xml": (".obj", ".ply", ".serialized", ".exr", ".hdr"),
 }
-"""Suffixes of files that refer to others, and the suffixes of these besides pictures."""
+"""Suffixes of files that refer to others, and the suffixes of these besides
+pictures.
+"""
 
 ENVIRONMENT_SUFFIXES = (".glb", ".gltf", ".bin", ".exr", ".hdr")
 """Suffixes of files besides pictures that the YAML file of an environment may name."""

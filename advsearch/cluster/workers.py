@@ -136,7 +136,9 @@ class PoolWorkers:
         return bool(waiting)
 
     def _deadline(self, n_items: int, item_seconds: Sequence[float]) -> float:
-        """Return the seconds after which a worker counts as hanging, and ends itself."""
+        """Return the seconds after which a worker counts as hanging, and ends
+        itself.
+        """
         if len(item_seconds) < MIN_BATCHES:
             deadline = LOAD_DEADLINE
         else:
@@ -222,7 +224,8 @@ def open_workers(
         tell: takes messages for the user.
 
     Yields:
-        The workers, None if `workers` and `cluster` are None: then this process does all.
+        The workers, None if `workers` and `cluster` are None: then this process does
+            all.
     """
     if workers is None and cluster is None:
         yield None

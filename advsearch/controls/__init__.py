@@ -48,12 +48,12 @@ def make_control(
     """Return a control from its name and settings.
 
     Args:
-        control_name: "kind"; "kind:mesh" for what is about one mesh, and that another than the
-            object (pose:chair); else "kind:name" for an instance with a name of its own
-            (light:key); or "kind.parameter" to search one parameter only, over its
-            default range. With "kind" among the settings, this is the instance's name.
-            A kind is a word, or "package.module:Class" where the class has a capital
-            and the module is no control.
+        control_name: "kind"; "kind:mesh" for what is about one mesh, and that another
+            than the object (pose:chair); else "kind:name" for an instance with a name
+            of its own (light:key); or "kind.parameter" to search one parameter only,
+            over its default range. With "kind" among the settings, this is the
+            instance's name. A kind is a word, or "package.module:Class" where the class
+            has a capital and the module is no control.
         settings: values for its parameters and choices; None or missing keeps the
             default.
 
@@ -153,7 +153,9 @@ def check_instance_name(label: str, name: str, colon: str = ":") -> None:
 
 
 def _get_default_range(control: type[Control], parameter: str) -> object:
-    """Return the range, or the choices, of a parameter that is searched by name alone."""
+    """Return the range, or the choices, of a parameter that is searched by name
+    alone.
+    """
     if not control.parameters:
         raise InputError(
             f"`controls` {control.kind}.{parameter}: expected a range, as in "
@@ -186,7 +188,8 @@ def check_control_settings(
     for name, control_settings in group_mitsuba_keys(settings).items():
         if control_settings is not None and not isinstance(control_settings, Mapping):
             raise InputError(
-                f"`controls` {name}: expected {{PARAMETER: VALUE}}, got {control_settings!r}"
+                f"`controls` {name}: expected {{PARAMETER: VALUE}}, got "
+                f"{control_settings!r}"
             )
         by_name[name] = control_settings or {}
     return by_name
@@ -200,8 +203,8 @@ def merge_control_settings(
     `camera.azimuth` and `camera.elevation` become one control that searches both.
 
     Args:
-        settings: settings by name; a name may be "kind", "kind:name", "kind.parameter" or
-            "kind:name.parameter".
+        settings: settings by name; a name may be "kind", "kind:name", "kind.parameter"
+            or "kind:name.parameter".
     """
     by_control: dict[str, dict[str, object]] = {}
     for name, control_settings in check_control_settings(settings).items():
@@ -235,12 +238,16 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
         names = ", ".join(control.name for control in controls)
         example = f"{first.name}:KEY=[0.2, 0.8]"
         if first.parameters:
-            one = next(
-                (one for one in first.instance_parameters if one.search is not None),
+            parameter = next(
+                (
+                    parameter
+                    for parameter in first.instance_parameters
+                    if parameter.search is not None
+                ),
                 first.instance_parameters[0],
             )
-            low, high = one.search or (one.low, one.high)
-            example = f"{first.name}={{{one.name}: [{low:g}, {high:g}]}}"
+            low, high = parameter.search or (parameter.low, parameter.high)
+            example = f"{first.name}={{{parameter.name}: [{low:g}, {high:g}]}}"
         raise InputError(
             f"`controls` {names}: every parameter is fixed, so there is nothing to "
             "search; give one a range, "

@@ -94,7 +94,8 @@ def describe_adjusted_defaults(adjusted: Sequence[AdjustedDefault]) -> list[str]
     for control, values in groupby(adjusted, key=lambda value: value.control):
         adjustments = " and ".join(map(_describe_adjustment, values))
         result.append(
-            f"The clean scene has {adjustments}, which the control {control} leaves out."
+            f"The clean scene has {adjustments}, which the control {control} leaves "
+            "out."
         )
     return result
 
@@ -141,7 +142,8 @@ def list_replaced_settings(
             continue
         if name in before.requested:
             raise InputError(
-                f"`set` {name}={format_value(scene)} and `controls` {control} contradict each "
+                f"`set` {name}={format_value(scene)} and `controls` {control} "
+                "contradict each "
                 "other: the control makes it "
                 f"{format_rounded(value)}; change one of the two, or leave one out"
             )
@@ -245,7 +247,8 @@ class Control:
         amount: the parameter whose value in the scene as it was described means that
             the rest of the control does not show: the power of a lamp, say. None where
             the scene has all parameters of itself.
-        instance_parameters: the parameters of this instance: `declare_parameters` of its settings.
+        instance_parameters: the parameters of this instance: `declare_parameters` of
+            its settings.
         chosen: what is chosen, by name; the default where nothing was said.
         specs: what parameters were set to, of those that were given.
         has_requested_search: whether a parameter was given a range or a list.
@@ -256,8 +259,8 @@ class Control:
             d.
         slots: once bound, each parameter with what it is set to, in the order of its
             coordinates; none where its coordinates are no parameters one by one.
-        adjusted_defaults: once bound, values of the clean scene that the start has not, because the
-            control leaves them out.
+        adjusted_defaults: once bound, values of the clean scene that the start has not,
+            because the control leaves them out.
         refines: the scene inputs that it takes from the controls before it, and may
             change (a patch on a texture).
         on_top: what it refines lies over what all other controls make of it, whatever
@@ -266,8 +269,8 @@ class Control:
             read in, below 0 from the bottom; see `advsearch.scene.formation`.
         flashes: how often a second it changes its light at most.
         travels: whether it moves something along a path; it has `seconds` and
-            `distances()` then, and its parameter `PATH_PARAMETER` says which path is taken where
-            there are several.
+            `distances()` then, and its parameter `PATH_PARAMETER` says which path is
+            taken where there are several.
         competes_with_ambient: whether it throws light that ambient light weakens, see
             `ambient`.
 
@@ -358,7 +361,9 @@ class Control:
         """
 
     def to_settings(self) -> dict[str, object]:
-        """Return what `make_control` needs to make an equal instance, as JSON values."""
+        """Return what `make_control` needs to make an equal instance, as JSON
+        values.
+        """
         if self.name == self.kind:
             return dict(self._settings)
         return {"kind": self.kind, **self._settings}
@@ -462,7 +467,9 @@ class Control:
         return defaults
 
     def is_searched(self, parameter: str) -> bool:
-        """Return whether a parameter with a range of its own is among what is searched."""
+        """Return whether a parameter with a range of its own is among what is
+        searched.
+        """
         if parameter in self.specs:
             return not isinstance(self.specs[parameter], Fixed)
         return not self.has_requested_search
@@ -606,9 +613,11 @@ class Control:
             label = f"{self.name}.{parameter.name}"
             if setting in self.scene.requested:
                 raise InputError(
-                    f"{self._quote_setting(setting)} and `controls` {self.name} contradict "
+                    f"{self._quote_setting(setting)} and `controls` {self.name} "
+                    "contradict "
                     f"each other: {label} is {slot.spec}, "
-                    f"which leaves {format_value(scene_value)} out; change one of the two, or "
+                    f"which leaves {format_value(scene_value)} out; change one of the "
+                    "two, or "
                     "leave one out"
                 )
             if not isinstance(self.specs.get(parameter.name), Fixed):
@@ -639,7 +648,8 @@ class Control:
         budget = self.get_budget(parameter)
         if type(spec) is not Range and budget != FULL_RANGE:
             raise InputError(
-                f"{self.name}.{name}: it has a ball and no distribution; give it a range"
+                f"{self.name}.{name}: it has a ball and no distribution; give it a "
+                "range"
             )
         return Group(
             name,
@@ -686,7 +696,8 @@ class Control:
         """Return every parameter's value at a slice of u, fixed ones too.
 
         Returns:
-            By name, float32 of the parameter's shape; of a choice the index of its option.
+            By name, float32 of the parameter's shape; of a choice the index of its
+            option.
         """
         values: dict[str, Tensor] = {}
         if not self.slots:
@@ -758,8 +769,8 @@ class Control:
     ) -> dict[str, Value]:
         """Describe a configuration by a few named values with units.
 
-        Small enough for one row of a table; a function of its arguments alone, which are
-        those of `inputs`.
+        Small enough for one row of a table; a function of its arguments alone, which
+        are those of `inputs`.
         """
         values = self.values(u.detach())
         described: dict[str, Value] = {}

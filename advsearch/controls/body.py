@@ -115,7 +115,9 @@ class BodyControl(Control):
         super().fit()
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter with the value of the rig; not searched if the rig lacks it."""
+        """Return a parameter with the value of the rig; not searched if the rig lacks
+        it.
+        """
         default = self.rig.defaults.get(parameter.name)
         if default is None:
             return replace(super().resolve_parameter(parameter), search=None)

@@ -211,7 +211,9 @@ class CameraControl(Control):
         return "shift_x" in self.specs or "shift_y" in self.specs
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter with the default and the range of the scene's own camera."""
+        """Return a parameter with the default and the range of the scene's own
+        camera.
+        """
         parameter = adapt_length_unit(
             super().resolve_parameter(parameter), self.scene.object.metres is not None
         )
@@ -376,12 +378,10 @@ class CameraControl(Control):
                 elevation.sin(),
             ]
         )
-        left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
-        up = torch.linalg.cross(-outwards, left)
-        left, up = (
-            roll.cos() * left + roll.sin() * up,
-            roll.cos() * up - roll.sin() * left,
-        )
+        level_left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
+        level_up = torch.linalg.cross(-outwards, level_left)
+        left = roll.cos() * level_left + roll.sin() * level_up
+        up = roll.cos() * level_up - roll.sin() * level_left
         position = (
             torch.from_numpy(compute_center(self.scene)).to(distance)
             + distance * outwards

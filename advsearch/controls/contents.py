@@ -100,15 +100,31 @@ def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
     heights = np.linspace(floor, floor + FILL_LIMIT * depth, WALL_ROWS)
     # a ray along a flat floor would see anything
     lowest = floor + 0.004 * depth
-    walls = [_find_wall(mesh, axis, max(float(height), lowest)) for height in heights]
-    radii = np.stack([distance for distance, _ in walls])
+    rows = [_find_wall(mesh, axis, max(float(height), lowest)) for height in heights]
+    distances, faces = zip(*rows, strict=True)
+    radii = _fill_missed_radii(np.stack(distances))
+    if radii is None:
+        return None
+    lower_faces = np.concatenate(faces[: WALL_ROWS // 2])
+    wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
+    return Vessel(axis, heights, radii, wall_color)
+
+
+def _fill_missed_radii(radii: assets.Float64Array) -> assets.Float64Array | None:
+    """Replace what rays missed by the median of its height.
+
+    Args:
+        radii: distances (rows, rays) from the axis to the wall, not finite where a ray
+            hit nothing.
+
+    Returns:
+        (rows, rays); None if too few rays hit a wall.
+    """
     is_hit = np.isfinite(radii)
     if is_hit.mean() < MIN_HIT_FRACTION or not is_hit.any(axis=1).all():
         return None
     medians = np.array([np.median(row[np.isfinite(row)]) for row in radii])
-    lower_faces = np.concatenate([face for _, face in walls[: WALL_ROWS // 2]])
-    wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
-    return Vessel(axis, heights, np.where(is_hit, radii, medians[:, None]), wall_color)
+    return np.where(is_hit, radii, medians[:, None])
 
 
 def _mean_face_color(
@@ -362,7 +378,9 @@ class ContentsControl(Control):
         return bounds
 
     def _check_total(self, least_total: float) -> None:
-        """Check that the proportions can add up to 1. Raises InputError: they cannot."""
+        """Check that the proportions can add up to 1. Raises InputError: they
+        cannot.
+        """
         largest_total = sum(upper for _, upper in self.proportion_bounds.values())
         all_set = len(self.proportion_bounds) == len(INGREDIENTS)
         too_little = all_set and largest_total < 1.0 - SUM_TOLERANCE

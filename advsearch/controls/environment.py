@@ -7,9 +7,9 @@ map is resampled by torch:
     map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1]
     rotation / 360 * columns = k + f
 
-`compute_harmonic_light` adds real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan
-2001, section 3), 9 coefficients for each colour channel as multiples of the map's mean
-radiance, inside an L2 ball.
+`compute_harmonic_light` adds real spherical harmonics of degrees 0 to 2 (Ramamoorthi
+and Hanrahan 2001, section 3), 9 coefficients for each colour channel as multiples of
+the map's mean radiance, inside an L2 ball.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ class EnvironmentControl(Control):
         Choice(
             "epsilon",
             0.5,
-            "Radius of the ball of `compute_harmonic_light`: L2 norm of all coefficients.",
+            "Radius of the ball of `compute_harmonic_light`: L2 norm of all "
+            "coefficients.",
             "epsilon",
             "harmonics",
             most=100.0,
@@ -93,7 +94,9 @@ class EnvironmentControl(Control):
 
     @classmethod
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters, with the files that `which` names among its options."""
+        """Return the parameters, with the files that `which` names among its
+        options.
+        """
         which, *others = cls.parameters
         setting = settings.get("which") if isinstance(settings, Mapping) else None
         setting = setting.get("choices") if isinstance(setting, Mapping) else setting
@@ -168,12 +171,12 @@ class EnvironmentControl(Control):
         """
         if parameter.name != "which":
             return super().resolve_parameter(parameter)
-        own_environment = (
+        control_environment = (
             None
             if SCENE_ENVIRONMENT in self.list_allowed_values("which", SCENE_ENVIRONMENT)
             else self._find_scene_environment_name(self.scene)
         )
-        return replace(parameter, default=own_environment or SCENE_ENVIRONMENT)
+        return replace(parameter, default=control_environment or SCENE_ENVIRONMENT)
 
     def setting_name(self, parameter: Parameter) -> str:
         return (
@@ -310,10 +313,10 @@ def rotate_map(radiance: Tensor, degrees: Tensor) -> Tensor:
     shift = torch.remainder(degrees / 360.0, 1.0) * columns
     if not shift.requires_grad and float(shift) == 0.0:
         return radiance
-    whole_columns = int(shift.detach().floor())
-    fraction = shift - whole_columns
-    lower = radiance.roll(-whole_columns, dims=1)
-    upper = radiance.roll(-whole_columns - 1, dims=1)
+    full_columns = int(shift.detach().floor())
+    fraction = shift - full_columns
+    lower = radiance.roll(-full_columns, dims=1)
+    upper = radiance.roll(-full_columns - 1, dims=1)
     return lower + fraction * (upper - lower)
 
 

@@ -126,6 +126,22 @@ class WeldedMesh:
 get_welded_mesh = lru_cache(maxsize=8)(WeldedMesh)  # of a mesh; kept in memory
 
 
+def _compute_landmark_weights(
+    positions: Float64Array, points: Float64Array, width: float, density: Float64Array
+) -> Float64Array:
+    """Return the normalized weights (P, N) of landmarks (N, 3) at positions (P, 3).
+
+    Args:
+        positions: of a mesh.
+        points: the landmarks.
+        width: of the kernel.
+        density: (N,) of the landmarks, which the kernel is divided by.
+    """
+    exponent = -cdist(positions, points, "sqeuclidean") / (2.0 * width**2)
+    weights = np.exp(exponent - exponent.max(axis=1, keepdims=True)) / density
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
 @lru_cache(maxsize=8)
 def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     """Return the smoothest displacement fields of a mesh that are no rigid motion.
@@ -137,8 +153,8 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
         count: number of fields.
 
     Returns:
-        (P, 3, count), for each position of `get_welded_mesh(mesh)`, smoothest first; the largest
-        length is 1 in each.
+        (P, 3, count), for each position of `get_welded_mesh(mesh)`, smoothest first;
+        the largest length is 1 in each.
     """
     welded_mesh = get_welded_mesh(mesh)
     points, cell = _landmarks(welded_mesh)
@@ -149,11 +165,8 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     combination = _without_rotation(points, functions, mass, energy, count)
 
     # Nystrom extension from the landmarks to all positions
-    exponent = -cdist(welded_mesh.positions, points, "sqeuclidean") / (2.0 * width**2)
-    weights = np.exp(exponent - exponent.max(axis=1, keepdims=True)) / density
-    extended = (weights / weights.sum(axis=1, keepdims=True)) @ (
-        functions / np.maximum(values, 0.05)
-    )
+    weights = _compute_landmark_weights(welded_mesh.positions, points, width, density)
+    extended = weights @ (functions / np.maximum(values, 0.05))
     fields = np.einsum("ps,sck->pck", extended, combination)
     return np.asarray(fields / np.linalg.norm(fields, axis=1).max(axis=0))
 
@@ -343,11 +356,11 @@ class DisplacementLimits:
         offsets = epsilon s d,    s = (1 + sum_i r_i^p)^(-1/p)
 
     with `r_i` what each bound would be used up to, 1 being all of it: the length of d
-    at each place (1), the gradient of the displacement along each face (`MAX_FACE_STRAIN`),
-    and between the two sides of each wall (`MAX_WALL_STRAIN`). As `s max r < 1`, no place
-    moves further than epsilon, no face turns over (its tangent map is I + B with ||B||
-    < 1, and so has a positive determinant), and walls and gaps between places keep more
-    than half their width. Epsilon is in the mesh's units.
+    at each place (1), the gradient of the displacement along each face
+    (`MAX_FACE_STRAIN`), and between the two sides of each wall (`MAX_WALL_STRAIN`). As
+    `s max r < 1`, no place moves further than epsilon, no face turns over (its tangent
+    map is I + B with ||B|| < 1, and so has a positive determinant), and walls and gaps
+    between places keep more than half their width. Epsilon is in the mesh's units.
     """
 
     def __init__(self, welded_mesh: WeldedMesh, epsilon: float) -> None:

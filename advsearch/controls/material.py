@@ -305,17 +305,18 @@ def brick(grid: Grid) -> Float64Array:
     )
     tone = np.random.Generator(np.random.PCG64(33)).random((rows, columns))
     brick_tone = tone[row.astype(np.int64) % rows, column.astype(np.int64)]
+    mortar = _color("c3bbac") + 0.10 * _clouds(grid, (80, 80), 2, 36)[..., None]
+    return _mix(mortar, _paint_fired_clay(grid, brick_tone), solid)
+
+
+def _paint_fired_clay(grid: Grid, brick_tone: Float64Array) -> Float64Array:
+    """Return the color of bricks of some tone, with grain and dark stains."""
     grain = _clouds(grid, (40, 40), 3, 34)
-    brick_color = _ramp(
+    clay = _ramp(
         brick_tone + 0.22 * grain, "7c2f22", "9a3f2b", "ad4d35", "bd6547", "a5553c"
     )
-    brick_color = _mix(
-        brick_color,
-        _color("4f211a"),
-        0.5 * _step(_clouds(grid, (70, 70), 2, 35), 0.35, 0.2),
-    )
-    mortar = _color("c3bbac") + 0.10 * _clouds(grid, (80, 80), 2, 36)[..., None]
-    return _mix(mortar, brick_color, solid)
+    stains = 0.5 * _step(_clouds(grid, (70, 70), 2, 35), 0.35, 0.2)
+    return _mix(clay, _color("4f211a"), stains)
 
 
 @register_pattern(0.45, roughness=0.95, specular=0.1)
@@ -440,6 +441,32 @@ def rust(grid: Grid) -> Float64Array:
     return _mix(surface, _color("1b0d09"), 0.6 * pits)
 
 
+def _bend_blades(
+    root: Float64Array,
+    lean: Float64Array,
+    bend: Float64Array,
+    length: Float64Array,
+    along: Float64Array,
+    across: Float64Array,
+) -> tuple[Float64Array, Float64Array]:
+    """Return x and y (blades, along, across) of the samples of bent blades.
+
+    Args:
+        root: (blades, 1, 1, 2) where they begin.
+        lean: (blades, 1, 1) angle at which they begin.
+        bend: (blades, 1, 1) angle by which they turn up to the tip.
+        length: (blades, 1, 1).
+        along: (1, along, 1) from 0 to 1.
+        across: (1, 1, across) from -1 to 1.
+    """
+    offset = across * 0.0042 * (1.0 - along**2)
+    heading = lean + bend * along
+    middle = lean + 0.5 * bend * along
+    x = root[..., 0] + length * along * np.cos(middle) - offset * np.sin(heading)
+    y = root[..., 1] + length * along * np.sin(middle) + offset * np.cos(heading)
+    return x, y
+
+
 @register_pattern(0.5, roughness=0.9, specular=0.1)
 def grass(grid: Grid) -> Float64Array:
     """Paint blades over each other, bent and lighter towards the tip.
@@ -456,11 +483,7 @@ def grass(grid: Grid) -> Float64Array:
     # of the samples of a blade: along it from 0 to 1, across it from -1 to 1
     along = np.linspace(0.0, 1.0, 64)[None, :, None]
     across = np.linspace(-1.0, 1.0, 5)[None, None, :]
-    offset = across * 0.0042 * (1.0 - along**2)
-    heading = lean + bend * along
-    middle = lean + 0.5 * bend * along
-    x = root[..., 0] + length * along * np.cos(middle) - offset * np.sin(heading)
-    y = root[..., 1] + length * along * np.sin(middle) + offset * np.cos(heading)
+    x, y = _bend_blades(root, lean, bend, length, along, across)
     brightness = 0.30 + 0.70 * along + 0.12 * across
     blade_color = _color("3f7a1e") + (_color("a5b446") - _color("3f7a1e")) * hue
     colors = np.broadcast_to(blade_color * brightness[..., None], (*x.shape, 3))
@@ -566,7 +589,7 @@ def _texel_surface(mesh: Mesh, side: int) -> tuple[Float32Array, Float32Array]:
 
 
 OBJECT_SURFACE = "own"
-SURFACE_PARAMETERS = tuple(one.name for one in MATERIAL)
+SURFACE_PARAMETERS = tuple(parameter.name for parameter in MATERIAL)
 
 
 class MaterialControl(Control):

@@ -66,7 +66,8 @@ class MitsubaControl(Control):
             color_spec = self.specs.get(plugin_number.key)
             if isinstance(color_spec, OneOf) and len(plugin_number.values) > 1:
                 raise InputError(
-                    f"`controls` {self.name}:{plugin_number.key}: expected a range, because "
+                    f"`controls` {self.name}:{plugin_number.key}: expected a range, "
+                    "because "
                     "it is a colour; values one by one "
                     "are for one channel, such as "
                     f"{self.name}:{plugin_number.key}.{color.CHANNELS[0]}"

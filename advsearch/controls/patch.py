@@ -473,7 +473,9 @@ class PatchPainter:
         normal: assets.Float64Array,
         reach: float,
     ) -> assets.IntArray:
-        """Return which texels (N,) are connected to a point, face its way and are close."""
+        """Return which texels (N,) are connected to a point, face its way and are
+        close.
+        """
         connected = np.flatnonzero(
             self._surface.find_region(face, point, normal, reach)[self._faces]
         )

@@ -120,7 +120,8 @@ class Range:
 
 @dataclass(frozen=True)
 class DistributionRange(Range):
-    """Values from `low` to `high`, the shares `lower_probability` to `upper_probability` of a distribution.
+    """Values from `low` to `high`, the shares `lower_probability` to
+    `upper_probability` of a distribution.
 
     Its quantiles, and what it is.
     """
@@ -214,7 +215,8 @@ def parse_spec(label: str, parameter: Parameter, setting: object) -> Spec:
         return _make_choice(label, values)
     if len(values) != 2:
         raise InputError(
-            f"{label}: expected a value, [low, high] or a list of values, got {setting!r}"
+            f"{label}: expected a value, [low, high] or a list of values, got "
+            f"{setting!r}"
         )
     low, high = (float(value) for value in values)
     _check_bounds(label, parameter, low, high)
@@ -545,7 +547,8 @@ def parse_distribution(
         raise InputError(
             f"{label}: {100.0 * outside:.3g} % of {text} lies outside of "
             f"{parameter.low:g} to {parameter.high:g} "
-            f"({parameter.unit}), and at most {100.0 * MAX_OUTSIDE_PROBABILITY:g} % is cut off; "
+            f"({parameter.unit}), and at most {100.0 * MAX_OUTSIDE_PROBABILITY:g} % is "
+            "cut off; "
             "choose a narrower one, or cut it "
             "yourself (truncnorm)"
         )

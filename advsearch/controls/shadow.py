@@ -152,7 +152,9 @@ class ShadowControl(Control):
         )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter, with the direction of the strongest light as the default."""
+        """Return a parameter, with the direction of the strongest light as the
+        default.
+        """
         x, y, z = find_strongest_light(self.scene)[0]
         match parameter.name:
             case "radii":

@@ -90,9 +90,9 @@ class Space:
     def _has_material_form(self) -> bool:
         """Return whether the material form of derivatives is valid in the scene.
 
-        It knows neither a medium nor a backdrop nor a lens nor the edges of cut-outs, nor
-        where a normal of a normal map turns away from the camera, nor meshes that emit
-        light.
+        It knows neither a medium nor a backdrop nor a lens nor the edges of cut-outs,
+        nor where a normal of a normal map turns away from the camera, nor meshes that
+        emit light.
         """
         scene = self.scene
         if scene is None:
@@ -130,8 +130,8 @@ class Space:
         """Map u to scene inputs, by differentiable torch operations.
 
         Controls that refine what others set come later, and those that lie on top last,
-        whatever the order in which they were requested. Raises InputError: two controls set
-        one input.
+        whatever the order in which they were requested. Raises InputError: two controls
+        set one input.
         """
         slices = u.split(self.sizes)
         merged = dict[str, Tensor]()

@@ -186,7 +186,8 @@ class TextureControl(Control):
             raise UnknownNameError(kind, self.mesh, known, hint) from None
 
     def _named_material(self, scene: SceneDescription) -> list[str]:
-        """Return the materials of the object that its name means, as in `texture:paint`.
+        """Return the materials of the object that its name means, as in
+        `texture:paint`.
 
         None where a mesh has that name.
         """
@@ -231,7 +232,9 @@ class TextureControl(Control):
     def _resample_original(
         self, part: MeshPart, materials: Sequence[str] | None
     ) -> Tensor:
-        """Return the original texture (h, w, 3) sRGB at the resolution of the search."""
+        """Return the original texture (h, w, 3) sRGB at the resolution of the
+        search.
+        """
         original = torch.from_numpy(part.base_color.copy())
         longer_side = max(original.shape[:2])
         resolution = self.chosen["resolution"]
@@ -290,7 +293,8 @@ class TextureControl(Control):
             if self.chosen["resolution"]:
                 remedy = "take a higher resolution, "
             raise InputError(
-                f"{self.name}.materials: other materials read {shared} % of the texels of "
+                f"{self.name}.materials: other materials read {shared} % of the texels "
+                "of "
                 f"{', '.join(names)} too, so that it cannot be painted alone; give "
                 "each material texels of its own in "
                 f"the file, {remedy}or leave materials out"
@@ -473,7 +477,8 @@ def compute_palette(image: Tensor, weight: Float32Array, count: int) -> Tensor:
 def _quantise_colors(
     image: Tensor, weight: Float32Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the mean colors (N, 3) of the 5-bit cells of an image, and their mass (N,).
+    """Return the mean colors (N, 3) of the 5-bit cells of an image, and their mass
+    (N,).
 
     The mass is the root of the summed weight, or else the shades of the largest surface
     take all centers.

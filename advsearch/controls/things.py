@@ -163,7 +163,9 @@ class ThingsControl(Control):
                 yield replace(parameter, name=name), spec
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter, with a range of positions that is not larger than a table."""
+        """Return a parameter, with a range of positions that is not larger than a
+        table.
+        """
         if parameter.name not in ("x", "y"):
             return parameter
         # beside a small thing, two metres are off its table
@@ -240,7 +242,8 @@ class ThingsControl(Control):
         return stands
 
     def _list_obstacles(self, so_far: Mapping[str, Tensor]) -> list[parts.Footprint]:
-        """List what a thing may not stand in: the object first, the camera, other things.
+        """List what a thing may not stand in: the object first, the camera, other
+        things.
 
         Things that move are not among them yet.
         """
@@ -264,6 +267,13 @@ class ThingsControl(Control):
             *(_footprint(scene, name, so_far) for name in fixed_things),
         ]
 
+    def _read_numbers(self, name: str, values: Values) -> list[float]:
+        """Return the values of a thing's parameters, without derivatives."""
+        return [
+            float(values[f"{name}.{parameter.name}"].detach())
+            for parameter in self.parameters
+        ]
+
     def _find_stand(
         self,
         name: str,
@@ -284,10 +294,7 @@ class ThingsControl(Control):
             solids: of the place, which it goes towards the object for.
         """
         scene = self.scene
-        x, y, heading, is_absent = (
-            float(values[f"{name}.{parameter.name}"].detach())
-            for parameter in self.parameters
-        )
+        x, y, heading, is_absent = self._read_numbers(name, values)
         foot = _foot(scene.meshes[name])
         requested = foot[:2] + np.array([x, y]) / scene.metres
         outline = _rotate_outline(base.outline - foot[:2], heading)
@@ -298,8 +305,7 @@ class ThingsControl(Control):
             gap = MIN_GAP / scene.metres
             pushed = _find_free_shift(footprint, direction, obstacles, solids, gap)
         position = requested + pushed * direction
-        height_above_ground = foot[2] - scene.get_ground_height(foot[:2])
-        height = height_above_ground + scene.get_ground_height(position)
+        height = _compute_height(scene, foot, position)
         return Stand(position, height, pushed), outline + position
 
 
@@ -353,6 +359,21 @@ def _find_free_shift(
         if begin < shift < end:
             shift = end + gap
     return shift
+
+
+def _compute_height(
+    scene: SceneDescription,
+    foot: assets.Float64Array,
+    position: assets.Float64Array,
+) -> float:
+    """Return the height at a position (2,) of a thing that is as far above the ground
+    there.
+
+    `foot` is the point (3,) that it stands at so far.
+    """
+    height_above_ground = foot[2] - scene.get_ground_height(foot[:2])
+    height: float = height_above_ground + scene.get_ground_height(position)
+    return height
 
 
 def _foot(part: parts.MeshPart) -> assets.Float64Array:

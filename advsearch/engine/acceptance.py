@@ -22,7 +22,8 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.scene.renderer import Renderer
 
-# largest accepted mean difference of the margin over the views (of a classifier: logits)
+# largest accepted mean difference of the margin over the views (of a classifier:
+# logits)
 MAX_MARGIN_BIAS = 0.3
 MAX_BIAS_FRACTION = 0.05
 """The same as a fraction of what the search has moved the margin, where that is larger.
@@ -43,8 +44,8 @@ class ComparedView:
     """A predicted image compared with traced ones.
 
     Attributes:
-        squared_error: mean squared error over the object, in levels of 255 squared; below 0
-            by chance where it is small.
+        squared_error: mean squared error over the object, in levels of 255 squared;
+            below 0 by chance where it is small.
         allowed_squared_error: the same of a rendered image.
         margin_bias: by how much its margin is larger than the traced one.
         n_traced: images that were traced.
@@ -114,7 +115,10 @@ class Deviation:
                 f"{self.levels:.1f} levels of 255 off on the object, where "
                 f"{ACCEPTED_FRACTION * self.allowed_levels:.1f} would do"
             )
-        return f"{self.margin_bias:+.2f} off in the margin, where {self.allowed_margin_bias:.2f} would do"
+        return (
+            f"{self.margin_bias:+.2f} off in the margin, where "
+            f"{self.allowed_margin_bias:.2f} would do"
+        )
 
 
 def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
@@ -151,8 +155,8 @@ def compare_with_traced(
         seed: of the noise of the traced images.
         spp: samples per pixel of the search.
         measure_margin: from an image and a configuration to the model's margin.
-        predicted_start: (H, W, 3) image that was predicted in its place before the search, if
-            there was one.
+        predicted_start: (H, W, 3) image that was predicted in its place before the
+            search, if there was one.
     """
     with torch.no_grad():
         rendered = renderer(u, seeds.stream(seed, "rendered"), spp)

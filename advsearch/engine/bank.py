@@ -90,7 +90,8 @@ class Condition:
         index: its index in the bank's sequence.
         u: (d,) coordinates of the condition.
         renderer: predicts images under it.
-        depends_on_searched_only: whether base colors under it depend only on what is searched.
+        depends_on_searched_only: whether base colors under it depend only on what is
+            searched.
     """
 
     index: int

@@ -67,7 +67,8 @@ class ParallelEvaluator:
     """Evaluates the queries of a problem, several at once where there are workers.
 
     Attributes:
-        optional_problem: the problem; None of a sweep, which has one for each scene and model.
+        optional_problem: the problem; None of a sweep, which has one for each scene and
+            model.
         executor: workers that run `make_worker_call`; None to evaluate in this process.
         key: identifies the problem among those of workers.
     """
@@ -438,8 +439,8 @@ class Journal:
 
         Args:
             evaluated: queries and their evaluations.
-            id_is_number: whether the id of a row is the number of its query, in whatever
-                order they come.
+            id_is_number: whether the id of a row is the number of its query, in
+                whatever order they come.
 
         Returns:
             The rows.

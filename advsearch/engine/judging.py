@@ -446,9 +446,9 @@ def _has_disjoint_classes(models: Sequence[Model], first: str, second: str) -> b
 # ---- domain and objective
 # What a search maximises, over which domain, and the terms that `printable` subtracts:
 # the variation of colors, and their distance from printable ones (Sharif et al. 2016,
-# *Accessorize to a Crime*, sections 5.2.2 and 5.2.3). Theirs are sums over pixels, and a
-# product of distances to all printable colors; these are means, and the distance to the
-# nearest, which is zero at the same colors.
+# *Accessorize to a Crime*, sections 5.2.2 and 5.2.3). Theirs are sums over pixels, and
+# a product of distances to all printable colors; these are means, and the distance to
+# the nearest, which is zero at the same colors.
 
 
 def make_domain(

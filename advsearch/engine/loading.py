@@ -81,7 +81,8 @@ class Scene:
 
     Attributes:
         description: the scene as data.
-        is_session_only: whether it holds Python objects that no file and no command can name.
+        is_session_only: whether it holds Python objects that no file and no command can
+            name.
     """
 
     description: SceneDescription
@@ -310,7 +311,8 @@ def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
     texels: Float32Array = array.astype(np.float32) / scale
     if texels.ndim != 3 or texels.shape[2] != 3 or not texels.size:
         raise InputError(
-            f"texture: expected a picture (h, w, 3), got an array of shape {array.shape}"
+            "texture: expected a picture (h, w, 3), got an array of shape "
+            f"{array.shape}"
         )
     is_in_range = texels.min() >= 0.0 and texels.max() <= 1.0
     if not np.isfinite(texels).all() or not is_in_range:
@@ -324,8 +326,8 @@ def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
 def scene_to_settings(scene: Scene) -> dict[str, Any]:
     """Return the settings by which a configuration names a loaded scene.
 
-    The keys are those of `SceneConfig`; a scene with `list_session_only_controls` has parts that these
-    settings cannot name.
+    The keys are those of `SceneConfig`; a scene with `list_session_only_controls` has
+    parts that these settings cannot name.
     """
     description = scene.description
     return {
@@ -511,8 +513,8 @@ def _measure_max_motion(
 ) -> float:
     """Return how many pixels a point moves at most in a duration in seconds.
 
-    It is measured on `N_MOTION_SAMPLES` random configurations of the controls that move, on points
-    that are visible before and after.
+    It is measured on `N_MOTION_SAMPLES` random configurations of the controls that
+    move, on points that are visible before and after.
     """
     moving_controls = tuple(
         control for control in space.controls if any(control.exposure)
@@ -655,7 +657,8 @@ def _read_control_list(
             added = {control.name: control}
         else:
             raise InputError(
-                f"controls: expected names or Control instances, got {describe_value(control)}"
+                "controls: expected names or Control instances, got "
+                f"{describe_value(control)}"
             )
         for name in added:
             if name in control_by_name:

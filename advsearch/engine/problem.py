@@ -74,7 +74,9 @@ exact.
 """
 
 MAX_CACHED_COORDINATES = 64
-"""Coordinates, beside base colors, of a configuration whose truth is cached, at most."""
+"""Coordinates, beside base colors, of a configuration whose truth is cached, at
+most.
+"""
 
 MAX_CACHED_TRUTHS = 512
 """Truths that are cached, at most."""
@@ -105,8 +107,8 @@ class Problem:
         space: all controls: those that are searched, then those that vary by chance.
         model: predicts what an image shows.
         task: judges the model's output, and defines success.
-        make_facts: returns what the task judges by, from functions that describe and render
-            a configuration.
+        make_facts: returns what the task judges by, from functions that describe and
+            render a configuration.
         objective: the function that a search maximises; None of a sweep.
         spp: samples per pixel of a search.
         seed: root seed.
@@ -212,8 +214,8 @@ class Problem:
     def add_conditions(self, u: Tensor, draw_seed: int | None = None) -> Tensor:
         """Return the full configuration: u (d,), and conditions behind it.
 
-        `draw_seed` is the seed of the conditions; without, they are those that leave the
-        scene unchanged.
+        `draw_seed` is the seed of the conditions; without, they are those that leave
+        the scene unchanged.
         """
         if self.conditions is None:
             return u
@@ -231,7 +233,8 @@ class Problem:
             u: (d,) the configuration.
             seed: of the noise and, if they are drawn, of the conditions.
             spp: samples per pixel.
-            with_conditions: whether conditions are drawn; else they leave the scene unchanged.
+            with_conditions: whether conditions are drawn; else they leave the scene
+                unchanged.
 
         Returns:
             (H, W, 3) sRGB in [0, 1], rounded to 8 bits.
@@ -266,8 +269,8 @@ class Problem:
         Args:
             images: (N, H, W, 3).
             full_configurations: N full configurations.
-            stated_values: N mappings of values that replace those of the configurations, as
-                for `truth`.
+            stated_values: N mappings of values that replace those of the
+                configurations, as for `truth`.
         """
         with torch.no_grad():
             output = self.model(images)
@@ -328,8 +331,8 @@ class Problem:
             full_u: the full configuration.
             seed: of the noise of the traced images.
             spp: samples per pixel of a rendered image.
-            is_random: (d,) bool, the searched coordinates that are random here: the search
-                has not moved them.
+            is_random: (d,) bool, the searched coordinates that are random here: the
+                search has not moved them.
         """
         dim = self.domain.dim
         with torch.no_grad():
@@ -367,13 +370,13 @@ class Problem:
     ) -> Truth:
         """Return what is true of the scene at a full configuration; None for the start.
 
-        Values that are `stated_values` replace those of the configuration, which has single
-        precision only.
+        Values that are `stated_values` replace those of the configuration, which has
+        single precision only.
         """
         if full_u is None or not self.task.varies:
             return self._start_truth
-        # What the camera sees first does not depend on base colors. So a truth is cached
-        # if few other coordinates exist, unless the task reads numbers.
+        # What the camera sees first does not depend on base colors. So a truth is
+        # cached if few other coordinates exist, unless the task reads numbers.
         geometric_u = full_u.detach()[self._is_geometric]
         key = geometric_u.numpy().tobytes()
         if not stated_values and key in self._truths:
@@ -426,7 +429,8 @@ class Problem:
     def describe(self, u: Tensor, draw_seed: int | None = None) -> dict[str, Value]:
         """Describe the searched controls of a configuration in values with units.
 
-        `draw_seed` is the seed of the conditions; without, they leave the scene unchanged.
+        `draw_seed` is the seed of the conditions; without, they leave the scene
+        unchanged.
         """
         return self.space.describe(
             self.add_conditions(u, draw_seed), self.space.controls[: self.n_searched]
@@ -464,7 +468,9 @@ class Problem:
         return abs(difference) / 2.0, lower["unit"]
 
     def describe_conditions(self, u: Tensor, draw_seed: int) -> dict[str, Value]:
-        """Describe the conditions of a draw in values with units; {} without conditions."""
+        """Describe the conditions of a draw in values with units; {} without
+        conditions.
+        """
         if self.conditions is None:
             return {}
         return self.space.describe(
@@ -830,9 +836,9 @@ def compute_condition_weights(values: Tensor) -> Tensor:
 
     The smaller the objective of a condition is, the larger is its weight. The mean
     weight is 1. The mean of all objectives would be raised most easily where the
-    prediction is wrong already. Weights of exp(-z), where z is the objective in standard
-    deviations, raise it where that is not so (Li et al. 2021, *Tilted Empirical Risk
-    Minimization*, section 2, with a tilt of the opposite sign).
+    prediction is wrong already. Weights of exp(-z), where z is the objective in
+    standard deviations, raise it where that is not so (Li et al. 2021, *Tilted
+    Empirical Risk Minimization*, section 2, with a tilt of the opposite sign).
     """
     objectives = values.detach()
     spread = objectives.new_zeros(())

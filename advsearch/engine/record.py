@@ -126,7 +126,8 @@ def make_trial_row(
         spp: samples per pixel.
         judgement: its judgement.
         values: of the configuration.
-        has_success: whether a search seeks some prediction; else the row has no success.
+        has_success: whether a search seeks some prediction; else the row has no
+            success.
     """
     row = Row(
         kind,

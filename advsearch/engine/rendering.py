@@ -1,4 +1,6 @@
-"""Render images of a scene before anything is searched, with the model's predictions."""
+"""Render images of a scene before anything is searched, with the model's
+predictions.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,8 @@ class View:
         output: of the model, for its task.
         truth: of the scene; None where the task does not depend on what is visible, or
             where it is unknown.
-        things: visible parts of the object and each thing beside it, see `find_visible_things`.
+        things: visible parts of the object and each thing beside it, see
+            `find_visible_things`.
     """
 
     azimuth: float
@@ -473,7 +476,9 @@ def _make_view_facts(
     u: Tensor,
     settings: _ViewSettings,
 ) -> Facts:
-    """Return the facts of a configuration (d,), with a view for each camera of a rig."""
+    """Return the facts of a configuration (d,), with a view for each camera of a
+    rig.
+    """
     facts, *camera_facts = [
         make_facts(
             description,
@@ -514,7 +519,8 @@ def list_camera_renders(
 ) -> list[Callable[[], Surfaces]]:
     """Return functions that render what is visible at a configuration (d,).
 
-    The first renders the view of the camera; the others those of the `n_rig_cameras` of a rig.
+    The first renders the view of the camera; the others those of the `n_rig_cameras` of
+    a rig.
     """
     return [
         partial(renderer.surfaces, u),
@@ -543,7 +549,8 @@ def make_facts(
         describe: describes the configuration; other parameters have the values of the
             scene.
         render_surfaces: renders what the camera sees; it is called once at most.
-        judge: the thing that is judged: `OBJECT`, the name of one beside it, or `ALL_THINGS`.
+        judge: the thing that is judged: `OBJECT`, the name of one beside it, or
+            `ALL_THINGS`.
 
     Raises:
         UnknownNameError: no thing has the name `judge`.

@@ -92,8 +92,8 @@ class SurfaceLight(PredictedSearch):
 
     Attributes:
         light_u: (d,) configuration whose light is computed; None for the start.
-        moving_coordinates: indices of the coordinates of u that move; None for those of cameras and
-            environments.
+        moving_coordinates: indices of the coordinates of u that move; None for those of
+            cameras and environments.
     """
 
     method: ClassVar[str] = "surface light"
@@ -108,7 +108,9 @@ class SurfaceLight(PredictedSearch):
     _looks: dict[tuple[int, int], list[LitCameraView]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Find which coordinates move cameras, change environments and color surfaces."""
+        """Find which coordinates move cameras, change environments and color
+        surfaces.
+        """
         problem = self.problem
         space = problem.space
         n_searched = problem.domain.dim
@@ -201,7 +203,9 @@ class SurfaceLight(PredictedSearch):
         return super().count_predicted(kind, evaluations)
 
     def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
-        """Compute the light under every condition of the bank, and compare its images."""
+        """Compute the light under every condition of the bank, and compare its
+        images.
+        """
         problem = self.problem
         u = problem.domain.start if self.light_u is None else self.light_u
         with self.count_time(), torch.no_grad():
@@ -356,7 +360,8 @@ class SurfaceLight(PredictedSearch):
         u: Tensor,
         key: tuple[int, int] | None = None,
     ) -> Tensor:
-        """Return predicted images (n, H, W, 3) of u (d,) under conditions, with a graph.
+        """Return predicted images (n, H, W, 3) of u (d,) under conditions, with a
+        graph.
 
         What cameras see is stored under `key`, if there is one, for later calls.
         """
@@ -379,8 +384,9 @@ class SurfaceLight(PredictedSearch):
     def replay(self, query: Query) -> None:
         """Compare predictions where that is due.
 
-        That is every `COMPARISON_INTERVAL` evaluations where base colors are searched, as their light
-        gets old; else after twice as many each time, until predictions are too far off.
+        That is every `COMPARISON_INTERVAL` evaluations where base colors are searched,
+        as their light gets old; else after twice as many each time, until predictions
+        are too far off.
         """
         if query.kind != "search" or query.phase != "search" or self.tracing_reason:
             return

@@ -1,9 +1,9 @@
 """Searches whose images are predicted, and their simplest predictor: a matrix.
 
 The matrix of light transport predicts images where nothing varies by chance. Every
-`COMPARISON_INTERVAL` evaluations predictions are compared with traced images: where they are too far
-off (`engine.acceptance`), the matrix is computed again. The ranking and all trials trace
-paths.
+`COMPARISON_INTERVAL` evaluations predictions are compared with traced images: where
+they are too far off (`engine.acceptance`), the matrix is computed again. The ranking
+and all trials trace paths.
 """
 
 from __future__ import annotations
@@ -122,9 +122,10 @@ class PredictedSearch(ABC):
         n_traced: images that were traced, for the predictor and to compare it.
         seconds: spent on both.
         n_renewals: how often the predictor was computed again; None where it never is.
-        first_traced: by kind of search, the evaluation from which on images are traced, as
-            predictions were too far off.
-        tracing_reason: why images are traced, as a sentence; None while they are predicted.
+        first_traced: by kind of search, the evaluation from which on images are traced,
+            as predictions were too far off.
+        tracing_reason: why images are traced, as a sentence; None while they are
+            predicted.
     """
 
     method: ClassVar[str] = "matrix"
@@ -154,7 +155,9 @@ class PredictedSearch(ABC):
 
     @property
     def accuracy_refusal(self) -> Refusal | None:
-        """Why it cannot be used, by images that were traced to prepare it; None if it can."""
+        """Why it cannot be used, by images that were traced to prepare it; None if it
+        can.
+        """
         return None
 
     @abstractmethod
@@ -171,12 +174,16 @@ class PredictedSearch(ABC):
     def evaluate_all(
         self, queries: Sequence[Query], trace: Evaluate
     ) -> Iterator[Evaluation]:
-        """Evaluate queries of a search lazily; `trace` evaluates those not predicted."""
+        """Evaluate queries of a search lazily; `trace` evaluates those not
+        predicted.
+        """
         return map(self.evaluate, queries)
 
     @abstractmethod
     def measure_size(self) -> tuple[int, int]:
-        """Return the entries of the matrices, for one color channel, and their bytes."""
+        """Return the entries of the matrices, for one color channel, and their
+        bytes.
+        """
 
     def summarize_conditions(self) -> BankOfConditions | None:
         """Return the state of a bank of conditions; None where nothing varies."""

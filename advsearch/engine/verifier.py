@@ -95,7 +95,9 @@ class Verifier:
     def open(
         cls, run: RunDirectory, problem: Problem, ladder: Sequence[int], stages: Stages
     ) -> Verifier:
-        """Return a verifier that renders in this process and stores in a run directory."""
+        """Return a verifier that renders in this process and stores in a run
+        directory.
+        """
         return cls(Journal(run, ParallelEvaluator(problem)), ladder, stages)
 
     def __post_init__(self) -> None:
@@ -152,8 +154,8 @@ class Verifier:
 
         Args:
             candidates: configurations (d,) by name.
-            search_samples: samples that the searches took, which bound those of this choice
-                where conditions vary.
+            search_samples: samples that the searches took, which bound those of this
+                choice where conditions vary.
         """
         varies = self.problem.conditions is not None
         ladder = self.ladder
@@ -203,8 +205,8 @@ class Verifier:
         """Run the trials of the control group, unless they were run at this count.
 
         These are of the clean configuration, under the seeds of every other group. A
-        start that looked wrong at first is tried before the search, at a sample count of
-        its own, and then again.
+        start that looked wrong at first is tried before the search, at a sample count
+        of its own, and then again.
         """
         if self.has_clean_trials:
             return
@@ -242,7 +244,8 @@ class Verifier:
             kind: of the rows.
             result: result of the search.
             curtailed: whether only the verdict matters, and not the rate.
-            with_new_trials: whether both groups get new trials, numbered after all others.
+            with_new_trials: whether both groups get new trials, numbered after all
+                others.
         """
         verification = verify(
             self.evaluate_all,
@@ -311,7 +314,8 @@ class Verifier:
         has_success: bool = True,
         predictor: PredictedSearch | None = None,
     ) -> Iterator[Judgement]:
-        """Try configurations of a kind, numbered from 0, in batches that fit into memory.
+        """Try configurations of a kind, numbered from 0, in batches that fit into
+        memory.
 
         `find_configuration` returns the configuration (d,) of a number; see `trials`.
         """
@@ -371,12 +375,13 @@ class RetrialCondition:
         name: of the condition.
         problem: judges its images.
         spp: samples per pixel.
-        image_key: conditions of equal source share the rendered image of a trial, (H, W,
+        image_key: conditions of equal source share the rendered image of a trial, (H,
+            W,
             3) sRGB in [0, 1].
-        change_image: from the rendered image and the seed of the trial to the model's image;
-            None for the image itself.
-        radiance_key: conditions of equal light share the linear radiance of a trial, as their
-            scenes are equal and only tone curves or models differ; None for a
+        change_image: from the rendered image and the seed of the trial to the model's
+            image; None for the image itself.
+        radiance_key: conditions of equal light share the linear radiance of a trial, as
+            their scenes are equal and only tone curves or models differ; None for a
             condition that renders by itself.
     """
 
@@ -428,7 +433,8 @@ class Retrials:
             for condition in conditions
         }
         self._clean: dict[str, tuple[Judgement, ...]] = {}
-        # shared images and radiances of `_shared_kind`, by source or light, seed and spp
+        # shared images and radiances of `_shared_kind`, by source or light, seed and
+        # spp
         self._images: dict[tuple[Hashable, int, int], Tensor] = {}
         self._radiances: dict[tuple[Hashable, int, int], Tensor] = {}
         self._shared_kind = ""

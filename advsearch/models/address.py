@@ -84,7 +84,8 @@ class AnswerStore(Protocol):
 
 
 def load(spec: str, purpose: models.Purpose) -> Model:
-    """Create the model behind an address; it is asked for its names if they are unknown.
+    """Create the model behind an address; it is asked for its names if they are
+    unknown.
 
     Raises:
         InputError: only a file names it, or as `check_address`.
@@ -197,7 +198,8 @@ class _Request:
 class _Connection(http.client.HTTPConnection):
     """A connection with a deadline, which another thread can break off at any time.
 
-    The timeout of a socket starts anew with each byte, so that it is no limit for an answer.
+    The timeout of a socket starts anew with each byte, so that it is no limit for an
+    answer.
     """
 
     deadline = math.inf
@@ -226,7 +228,9 @@ class _SecureConnection(_Connection, http.client.HTTPSConnection):
 
 
 class _TracksConnections(urllib.request.AbstractHTTPHandler):
-    """Opens connections with a deadline, and lists them for another thread to break off."""
+    """Opens connections with a deadline, and lists them for another thread to break
+    off.
+    """
 
     def __init__(self, end: float, connections: list[_Connection]) -> None:
         super().__init__()
@@ -260,8 +264,9 @@ class AddressModel(models.RemoteNetwork):
     """A model behind an address, as a network.
 
     It answers images (N, 3, H, W) in [0, 1], rounded to 8 bits: logits (N, names), or
-    without names the texts about each image (`advsearch.tasks.answers.AnswersWithoutLogits`). The same
-    image is not sent twice in a run, also if the run is resumed.
+    without names the texts about each image
+    (`advsearch.tasks.answers.AnswersWithoutLogits`). The same image is not sent twice
+    in a run, also if the run is resumed.
 
     Attributes:
         url: of requests.
@@ -273,7 +278,8 @@ class AddressModel(models.RemoteNetwork):
         tokens: maximum length of an answer in words.
         times: number of requests per image.
         names: with scores in answers.
-        spent: calls, and tokens in and out, of a run including what it was resumed from.
+        spent: calls, and tokens in and out, of a run including what it was resumed
+            from.
         store: the run that stores answers and what is spent.
         answer_cache: answers, if no run stores them.
     """
@@ -292,7 +298,9 @@ class AddressModel(models.RemoteNetwork):
     answer_cache: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __call__(self, pictures: Tensor) -> Any:
-        """Return logits (N, names) for images, or the texts about each; see the class."""
+        """Return logits (N, names) for images, or the texts about each; see the
+        class.
+        """
         levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8)
         images = list(levels.permute(0, 2, 3, 1).cpu().contiguous().numpy())
         if self.names:
@@ -345,8 +353,8 @@ class AddressModel(models.RemoteNetwork):
     def _get_answers(
         self, requests: Sequence[tuple[Image8Bit, int]]
     ) -> list[dict[str, Any]]:
-        """Return the answer to each image and turn: a stored one, or a new one, which is
-        stored as it arrives.
+        """Return the answer to each image and turn: a stored one, or a new one, which
+        is stored as it arrives.
 
         Trials differ in their noise, and so in their images.
         """
@@ -447,7 +455,9 @@ class AddressModel(models.RemoteNetwork):
 
     @property
     def _spent_by_limit(self) -> dict[str, float]:
-        """What has been spent, by the name of its limit; money in the unit of the prices."""
+        """What has been spent, by the name of its limit; money in the unit of the
+        prices.
+        """
         limits = self.limits
         spent = self.spent
         by_token = (
@@ -485,8 +495,8 @@ class AddressModel(models.RemoteNetwork):
             The index of each body, and the JSON object in the response to it.
 
         Raises:
-            ModelError: a limit is reached, nobody answers, or a response is invalid; the
-                responses up to then are yielded before.
+            ModelError: a limit is reached, nobody answers, or a response is invalid;
+                the responses up to then are yielded before.
         """
         pending = [
             _Request(index, MAX_TRIES, FIRST_DELAY) for index in range(len(bodies))
@@ -575,8 +585,8 @@ class AddressModel(models.RemoteNetwork):
     ) -> list[dict[str, Any] | Exception]:
         """Send bodies at the same time, and return the response to each, or its error.
 
-        It takes at most the limit of `seconds`, whatever a server does: connections that
-        are still open are broken off.
+        It takes at most the limit of `seconds`, whatever a server does: connections
+        that are still open are broken off.
         """
         seconds = self.limits["seconds"]
         deadline = time.monotonic() + seconds
@@ -641,7 +651,8 @@ class AddressModel(models.RemoteNetwork):
             if 300 <= status < 400:
                 location = self._clean(error.headers.get("Location", "elsewhere"))
                 reason = (
-                    f"sends on to {location}, and pictures and keys are not sent there; "
+                    f"sends on to {location}, and pictures and keys are not sent "
+                    "there; "
                     "give that address if you trust it"
                 )
             elif status in (401, 403):
@@ -703,7 +714,9 @@ class AddressModel(models.RemoteNetwork):
     def _make_error(
         self, expected: str, got: str | Mapping[str, Any]
     ) -> errors.ModelError:
-        """Return the error for an answer that is something else, or an object with other keys."""
+        """Return the error for an answer that is something else, or an object with
+        other keys.
+        """
         if isinstance(got, Mapping):
             got = self._clean(", ".join(map(str, got)) or "nothing")[:100]
         return errors.ModelError(

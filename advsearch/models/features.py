@@ -43,7 +43,9 @@ Read = Callable[[Tensor], Tensor]
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """A model as a differentiable function from images to features; created by `features_of`."""
+    """A model as a differentiable function from images to features; created by
+    `features_of`.
+    """
 
     model: Model
     read: Read = field(repr=False)
@@ -54,7 +56,8 @@ class Features:
     penultimate: bool = True
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Compute the features (N, F), float32, of images as `Model` takes them; differentiable.
+        """Compute the features (N, F), float32, of images as `Model` takes them;
+        differentiable.
 
         The network runs once more: the logits are not computed with them.
 
@@ -96,8 +99,8 @@ def features_of(model: Model) -> Features:
 
 
 class _Call(NamedTuple):
-    """A call of a layer: the layer, its input (None for weights) and output, and the axis of
-    channels.
+    """A call of a layer: the layer, its input (None for weights) and output, and the
+    axis of channels.
     """
 
     layer: Any
@@ -190,7 +193,9 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
 
 
 def _trace_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
-    """Return the calls of the layers of a graph of operators, such as a `torch.export` program."""
+    """Return the calls of the layers of a graph of operators, such as a `torch.export`
+    program.
+    """
     calls: list[_Call] = []
 
     class Reader(fx.Interpreter):
@@ -225,8 +230,8 @@ def pooled(returned: Any, *, token: bool) -> Tensor | None:
     """Return the features (N, D) in an output of a network, a tensor or what has one of
     `PARTS`; None if there are none.
 
-    Maps (N, D, H, W) are averaged over their positions. Of several tokens (N, T, D), the
-    first is taken with `token`, otherwise their mean.
+    Maps (N, D, H, W) are averaged over their positions. Of several tokens (N, T, D),
+    the first is taken with `token`, otherwise their mean.
     """
     for part in PARTS:
         value = (

@@ -144,7 +144,9 @@ def _load_torchscript(archive: Archive) -> Source:
 
 
 def _find_archive_kind(archive: Archive) -> str:
-    """Return ``"exported"`` or ``"torchscript"``; raise FileFormatError for anything else."""
+    """Return ``"exported"`` or ``"torchscript"``; raise FileFormatError for anything
+    else.
+    """
     path = archive.path
     names = archive.members
     if any(name.startswith("models/") and name.endswith(".json") for name in names):
@@ -304,8 +306,8 @@ def _batch_limits(program: torch.export.ExportedProgram, batch: Any) -> tuple[in
 
 
 def make_eight_bit(source: Source) -> Source:
-    """Return the source of a network that takes uint8 as one that takes floating-point images
-    from 0 to 255.
+    """Return the source of a network that takes uint8 as one that takes floating-point
+    images from 0 to 255.
     """
     return replace(
         source,
@@ -316,7 +318,9 @@ def make_eight_bit(source: Source) -> Source:
 
 
 def _advise_on_second_input(names: list[str]) -> str:
-    """Return what to do about a network of two inputs whose second is unknown; "" for others."""
+    """Return what to do about a network of two inputs whose second is unknown; "" for
+    others.
+    """
     if len(names) != 2:
         return ""
     return (
@@ -333,7 +337,10 @@ def _report_corrupt(path: Path, kind: str) -> AbstractContextManager[None]:
     problem = (
         f"model file {path}: cannot be read as {kind} with torch {torch.__version__}"
     )
-    causes = "damaged, made by another version, or in need of unpickling, which is never done"
+    causes = (
+        "damaged, made by another version, or in need of unpickling, which is "
+        "never done"
+    )
     return foreign(f"{problem}; {causes}", kind=FileFormatError)
 
 
@@ -352,8 +359,8 @@ older ones follow `../` and links.
 class OnnxNetwork(nn.Module):
     """A session of onnxruntime as a function from a batch of images to its outputs.
 
-    No gradient goes through it. `new_options` creates options of a run, by which it can be
-    ended.
+    No gradient goes through it. `new_options` creates options of a run, by which it can
+    be ended.
     """
 
     def __init__(self, session: Any, new_options: Callable[[], Any]) -> None:
@@ -421,7 +428,8 @@ def _open_session(path: Path) -> tuple[Any, Any]:
     release = re.match(r"(\d+)\.(\d+)", runtime.__version__)
     if release is None or (int(release[1]), int(release[2])) < MIN_VERSION:
         raise ModelError(
-            f"model {path}: needs onnxruntime {'.'.join(map(str, MIN_VERSION))} or newer, "
+            f"model {path}: needs onnxruntime {'.'.join(map(str, MIN_VERSION))} or "
+            "newer, "
             f"got {runtime.__version__}, which "
             "may read weights from anywhere that a file names: pip install -U "
             "'advsearch[onnx]'"
@@ -475,8 +483,8 @@ def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
 
 
 def _parse_image_size(text: str) -> list[int]:
-    """Parse (height, width) as YOLO's exporters write it, such as "[640, 640]"; empty if
-    it is no such text.
+    """Parse (height, width) as YOLO's exporters write it, such as "[640, 640]"; empty
+    if it is no such text.
     """
     match = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", text)
     size = [int(number) for number in match.groups()] if match else []

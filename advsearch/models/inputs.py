@@ -1,4 +1,6 @@
-"""Adapt networks with further inputs, or with integer images, to networks of images alone."""
+"""Adapt networks with further inputs, or with integer images, to networks of images
+alone.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,8 @@ class WithImageSize(nn.Module):
 
 @final
 class EightBitInput(nn.Module):
-    """A network that takes integers from 0 to 255 (uint8); the rounding has no gradient.
+    """A network that takes integers from 0 to 255 (uint8); the rounding has no
+    gradient.
 
     Args:
         network: from images in uint8, and further inputs, to an output.
@@ -70,7 +73,9 @@ class EightBitInput(nn.Module):
         self.training = False
 
     def forward(self, images: Tensor, *more: Tensor) -> Any:
-        """Return the network's output for floating-point images with values from 0 to 255."""
+        """Return the network's output for floating-point images with values from 0 to
+        255.
+        """
         return self.network(
             images.detach().round().clamp(0.0, 255.0).to(torch.uint8), *more
         )
@@ -111,10 +116,10 @@ PICTURE = "observation.image"  # the key of the image for a policy's `select_act
 class WithState(nn.Module):
     """A policy of images and a constant state.
 
-    A policy with a method `select_action` is called as LeRobot's are: with one mapping of the
-    images, as `PICTURE`, and of the state (numbers by name), after `reset` if it has one,
-    because it may still hold an earlier image. Others are called with the images and the
-    mapping, or with the images alone if the state is empty.
+    A policy with a method `select_action` is called as LeRobot's are: with one mapping
+    of the images, as `PICTURE`, and of the state (numbers by name), after `reset` if it
+    has one, because it may still hold an earlier image. Others are called with the
+    images and the mapping, or with the images alone if the state is empty.
     """
 
     def __init__(

@@ -42,15 +42,17 @@ NOTHING_NAMES = frozenset(
 
 
 def is_nothing_name(name: str) -> bool:
-    """Whether the name of a class stands for no thing: background, "no object", an index
-    without a class.
+    """Whether the name of a class stands for no thing: background, "no object", an
+    index without a class.
     """
     return re.sub(r"[\s_<>()\[\]-]+", "", name.casefold()) in NOTHING_NAMES
 
 
 @dataclass(frozen=True)
 class LabelSet:
-    """The classes that count as right for an object; both "coffee mug" and "cup" may be."""
+    """The classes that count as right for an object; both "coffee mug" and "cup" may
+    be.
+    """
 
     # the model's full label names, in the order in which they were asked for
     names: tuple[str, ...]
@@ -72,8 +74,9 @@ def find_label_set(
     """Find the classes that a text names.
 
     Terms are separated by commas. A term matches a class in any case if it equals the
-    class's label name or one of the comma-separated synonyms in it ("tench, Tinca tinca").
-    ``"#504"`` is always a class index; a bare ``"504"`` is one unless a label has that name.
+    class's label name or one of the comma-separated synonyms in it ("tench, Tinca
+    tinca"). ``"#504"`` is always a class index; a bare ``"504"`` is one unless a label
+    has that name.
 
     Args:
         text: the terms, e.g. ``"coffee mug,cup"``, or a sequence of terms and indices.
@@ -240,11 +243,11 @@ def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ..
 
 
 def parse_names(names: Any) -> tuple[str, ...] | None:
-    """Return the names of classes that a network states, in order, as YOLO's do in `names` and
-    in the metadata of their files.
+    """Return the names of classes that a network states, in order, as YOLO's do in
+    `names` and in the metadata of their files.
 
-    They are untrusted: a mapping from 0, 1, ... to names, a list of names, or the text of
-    one; None for anything else.
+    They are untrusted: a mapping from 0, 1, ... to names, a list of names, or the text
+    of one; None for anything else.
     """
     if isinstance(names, str):
         if len(names) > MAX_METADATA_CHARACTERS or not _FLAT.fullmatch(names):
@@ -271,8 +274,8 @@ _FLAT = re.compile(
 
 
 def _is_name_list(source: str | os.PathLike[str]) -> bool:
-    """Whether a text is names with commas between them, not the path of a file, which may be
-    missing.
+    """Whether a text is names with commas between them, not the path of a file, which
+    may be missing.
     """
     text = str(source)
     return (
@@ -352,8 +355,8 @@ def fit_labels(
     """Return the labels, or placeholders for None.
 
     Raises:
-        InputError: their number is not that of the model's classes; FileFormatError if they
-            are from a file.
+        InputError: their number is not that of the model's classes; FileFormatError if
+            they are from a file.
     """
     if labels is None:
         return tuple(f"class {index}" for index in range(classes))
@@ -435,7 +438,8 @@ def _find_problem(names: Sequence[Any]) -> str:
             )
         if len(name) > MAX_NAME_CHARACTERS:
             return (
-                f"expected a name of at most {MAX_NAME_CHARACTERS} characters for class "
+                f"expected a name of at most {MAX_NAME_CHARACTERS} characters for "
+                "class "
                 f"{index}, got {len(name):,}"
             )
     return ""

@@ -261,8 +261,8 @@ def _with_images_alone(
 
 
 def parse_code_reference(spec: str) -> str | None:
-    """Return the "package.module:attribute" that a model's name imports, None if it imports
-    nothing.
+    """Return the "package.module:attribute" that a model's name imports, None if it
+    imports nothing.
     """
     text = spec.strip()
     if text.partition(":")[0].lower() in SOURCES or not re.fullmatch(
@@ -332,7 +332,9 @@ def _unknown_model(text: str) -> UnknownNameError:
 
 
 def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
-    """Return the source of a network of transformers or timm; None for any other network."""
+    """Return the source of a network of transformers or timm; None for any other
+    network.
+    """
     for library, recognizer in list_built_ins("recognizer").items():
         if library in sys.modules:
             recognize: Callable[[nn.Module, Purpose], Source | None] = load_attribute(

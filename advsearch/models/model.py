@@ -1,5 +1,5 @@
-"""Define the model: a network as a differentiable function from display-referred images to
-its output.
+"""Define the model: a network as a differentiable function from display-referred images
+to its output.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from advsearch.models.labels import LabelSet, find_label_set
 
 
 class _Recomputed(torch.autograd.Function):
-    """Compute a function of images without storing activations; its gradient computes again.
+    """Compute a function of images without storing activations; its gradient computes
+    again.
 
     `torch.utils.checkpoint` does the same, but not under `autograd.grad`, and not with
     `mend_batch_norms`.
@@ -77,10 +78,12 @@ class _Recomputed(torch.autograd.Function):
 
 
 def compute_checkpointed(function: Callable[[Tensor], Any], images: Tensor) -> Any:
-    """Return `ask(images)`: tensors, in lists and mappings, without storing activations.
+    """Return `ask(images)`: tensors, in lists and mappings, without storing
+    activations.
 
-    Its gradient computes it a second time, and takes the memory of one batch instead of that
-    of all (Chen et al. 2016, *Training Deep Nets with Sublinear Memory Cost*, section 3).
+    Its gradient computes it a second time, and takes the memory of one batch instead of
+    that of all (Chen et al. 2016, *Training Deep Nets with Sublinear Memory Cost*,
+    section 3).
     """
     structure: list[Any] = []
     tensors = _Recomputed.apply(function, structure, images)  # type: ignore[no-untyped-call]
@@ -126,7 +129,9 @@ OUTPUTS_BY_TASK = {
 
 
 class RemoteNetwork:
-    """A network elsewhere that only answers; a run stores its answers and states their cost."""
+    """A network elsewhere that only answers; a run stores its answers and states their
+    cost.
+    """
 
     def __call__(self, pictures: Tensor) -> Any:
         """Return the network's output for images (N, 3, H, W) in [0, 1]."""
@@ -221,8 +226,8 @@ class Preprocessing:
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class Model:
-    """A network with all that is needed to run it on an image and to read its output. Created
-    by `load_model`.
+    """A network with all that is needed to run it on an image and to read its output.
+    Created by `load_model`.
 
     Args:
         module: the network. It takes what `preprocessing` returns and returns what
@@ -244,9 +249,9 @@ class Model:
             tensor (N, ...), or a list with one element for each; None for logits.
         spec: the argument of `load_model`, if that is all that defines the model; None
             for what exists in this session only.
-        cameras: how many images of a rig are side by side in each image. The network sees
-            them one by one; the output is then a list with a tuple of theirs for each
-            image.
+        cameras: how many images of a rig are side by side in each image. The network
+            sees them one by one; the output is then a list with a tuple of theirs for
+            each image.
         make_trainable: returns a new network with the same weights that can be trained
             further, if `module` is one made for inference alone; None for a copy of
             `module`.
@@ -275,7 +280,9 @@ class Model:
 
     @property
     def input_size(self) -> tuple[int, int]:
-        """(height, width) in pixels of the images that the network takes; others are resized."""
+        """(height, width) in pixels of the images that the network takes; others are
+        resized.
+        """
         return self.preprocessing.input_size
 
     @property
@@ -358,10 +365,11 @@ class Model:
         return copy.deepcopy(self.module)
 
     def with_network(self, network: nn.Module) -> Model:
-        """Return the same model with a network of the same kind in evaluation mode, whose weights
-        it shares.
+        """Return the same model with a network of the same kind in evaluation mode,
+        whose weights it shares.
 
-        It sees the weights as they are trained in place, and collects no gradients for them.
+        It sees the weights as they are trained in place, and collects no gradients for
+        them.
         """
         shared = copy_sharing_weights(network).eval().requires_grad_(False)
         return replace(self, module=shared, make_trainable=None)
@@ -375,8 +383,8 @@ class Model:
     def prepare(self, images: Tensor) -> Tensor:
         """Preprocess images (N, H, W, 3), at most a batch of them, for the network.
 
-        They get the network's dtype and device. Too small a batch is padded with the last
-        image. The result is a copy: the network may write into it.
+        They get the network's dtype and device. Too small a batch is padded with the
+        last image. The result is a copy: the network may write into it.
         """
         missing = self.batch_limits[0] - len(images)
         batch = images
@@ -434,12 +442,13 @@ DETACHING = (torch.Tensor.detach, torch.Tensor.detach_, torch.detach, torch.deta
 class DetachMode(TorchFunctionMode):
     """Observe whether a network detaches tensors, or ignore that it does.
 
-    RT-DETR and similar networks choose queries by the scores of their encoder, and detach
-    these from their decoder, in evaluation too: that makes training stable (Zhu et al.
-    2020, arXiv 2010.04159, appendix A.4), and hides from a search how the image moves them.
+    RT-DETR and similar networks choose queries by the scores of their encoder, and
+    detach these from their decoder, in evaluation too: that makes training stable (Zhu
+    et al. 2020, arXiv 2010.04159, appendix A.4), and hides from a search how the image
+    moves them.
 
-    `detach` does nothing if it is `ignored`; `has_detached` states whether something with a gradient
-    was to be detached.
+    `detach` does nothing if it is `ignored`; `has_detached` states whether something
+    with a gradient was to be detached.
     """
 
     def __init__(self, *, ignored: bool = False) -> None:
@@ -585,7 +594,8 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
     has_other_task = likely_task in ("detection", "segmentation", "depth", "similarity")
     if likely_task and has_other_task and not is_map:
         raise ModelError(
-            f"{expected}, got {describe_output(output)}; {_advise_other_task(likely_task)}"
+            f"{expected}, got {describe_output(output)}; "
+            f"{_advise_other_task(likely_task)}"
         )
     if tensor is None:
         raise ModelError(
@@ -653,7 +663,9 @@ def _find_logits(output: Any) -> Tensor | None:
 
 
 def _find_scores(returned: Any) -> Any:
-    """Return the scores in an output, of images or of pixels; None if there are none."""
+    """Return the scores in an output, of images or of pixels; None if there are
+    none.
+    """
     if isinstance(returned, Mapping) and "out" in returned:
         return returned["out"]
     return _find_logits(returned)
@@ -717,7 +729,8 @@ def _advise_on_shape(shape: tuple[int, ...]) -> str:
     """Return what to do about an output whose shape is not that of logits."""
     if len(shape) == 4:
         return (
-            f"{_advise_other_task('segmentation')}. If these are a classifier's feature "
+            f"{_advise_other_task('segmentation')}. If these are a classifier's "
+            "feature "
             "maps, wrap the network to pool them"
         )
     if len(shape) > 2:

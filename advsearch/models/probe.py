@@ -49,12 +49,14 @@ of the network's dtype: bfloat16 distinguishes 0.50 from 0.51 and no less.
 STEP = 1e-3
 
 MAX_GRADIENT_ERROR = 0.9
-"""Maximum relative error of what the gradient predicts: a wrong sign is an error of 2, a
-step function one of 1; kinks of ordinary networks stay below a half.
+"""Maximum relative error of what the gradient predicts: a wrong sign is an error of 2,
+a step function one of 1; kinks of ordinary networks stay below a half.
 """
 
 MAX_ATTACHED_ERROR = 0.5
-"""Maximum relative error of what a gradient predicts that replaces the network's own."""
+"""Maximum relative error of what a gradient predicts that replaces the network's
+own.
+"""
 
 MIN_RELATIVE_CHANGE = 0.15
 """Median relative change of an output between unlike images below which it hardly
@@ -197,7 +199,9 @@ def _warn_of_pixel_probabilities(model: Model, images: Tensor) -> None:
 
 
 def _warn_of_odd_scores(model: Model, rows: Tensor) -> None:
-    """Warn if rows (N, classes) are scores that are neither logits nor probabilities."""
+    """Warn if rows (N, classes) are scores that are neither logits nor
+    probabilities.
+    """
     kind = _describe_odd_scores(model, rows)
     if kind:
         warn(
@@ -229,7 +233,9 @@ def _run(model: Model, images: Tensor) -> Tensor:
 
 
 def _run_and_read(model: Model, images: Tensor) -> Any:
-    """Run a network that does not return logits on images (N, H, W, 3), and read its output."""
+    """Run a network that does not return logits on images (N, H, W, 3), and read its
+    output.
+    """
     assert model.read is not None
     return read_output(model.read, *_run_network(model, images), model.name)[
         : len(images)
@@ -237,8 +243,8 @@ def _run_and_read(model: Model, images: Tensor) -> Any:
 
 
 def _run_network(model: Model, images: Tensor) -> tuple[Any, int]:
-    """Return what the network returns for images (N, H, W, 3), and the size of its batch, which
-    may be larger.
+    """Return what the network returns for images (N, H, W, 3), and the size of its
+    batch, which may be larger.
     """
     x = model.prepare(images)
     with torch.set_grad_enabled(torch.is_grad_enabled()):
@@ -344,11 +350,12 @@ def _are_probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -
 
 
 def _describe_odd_scores(model: Model, rows: Tensor) -> str:
-    """Describe rows of scores (N, classes) that are neither logits nor probabilities; "" for
-    others.
+    """Describe rows of scores (N, classes) that are neither logits nor probabilities;
+    "" for others.
 
-    A black image distinguishes a sigmoid from means of the image, which are 0 there; colors
-    far outside [0, 1] distinguish it from small logits, as those of an untrained network.
+    A black image distinguishes a sigmoid from means of the image, which are 0 there;
+    colors far outside [0, 1] distinguish it from small logits, as those of an untrained
+    network.
     """
     least = float(rows.min())
     if least >= 0.0 and float(rows.max()) <= 1.0:
@@ -381,8 +388,8 @@ def _check_range(model: Model, images: Tensor) -> None:
     """Warn if a network seems to be made for colors from 0 to 255.
 
     That is, if its outputs hardly follow images (3, H, W, 3) that are black, white and
-    noise, but do so, at the same size, with these colors. A network in Python that returns
-    no logits is not checked: if it is untrained, it looks the same.
+    noise, but do so, at the same size, with these colors. A network in Python that
+    returns no logits is not checked: if it is untrained, it looks the same.
     """
     preprocessing = model.preprocessing
     is_declared = preprocessing.processor is not None or any(
@@ -424,10 +431,11 @@ def _check_range(model: Model, images: Tensor) -> None:
 
 @torch.no_grad()
 def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
-    """Return the numbers (K, n) that a network returns for images (K, H, W, 3), one by one.
+    """Return the numbers (K, n) that a network returns for images (K, H, W, 3), one by
+    one.
 
-    Scores in [0, 1] become logits, which do not saturate. None if there are no numbers, they
-    are not finite, or images have different counts of them.
+    Scores in [0, 1] become logits, which do not saturate. None if there are no numbers,
+    they are not finite, or images have different counts of them.
     """
     rows = []
     for image in images:
@@ -567,7 +575,8 @@ def _try_attached(
 
 
 def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows of `_run` for images, and the gradient of their `_compute_checked_value` value.
+    """Return the rows of `_run` for images, and the gradient of their
+    `_compute_checked_value` value.
 
     The gradient is zero if nothing is detected.
     """
@@ -588,7 +597,8 @@ def _compute_checked_value(rows: Tensor) -> Tensor:
 def _measure_change(
     model: Model, images: Tensor, step: Tensor, *gradients: Tensor
 ) -> tuple[float, list[float], list[Tensor], float]:
-    """Measure how the `_compute_checked_value` value changes over a step to both sides of images.
+    """Measure how the `_compute_checked_value` value changes over a step to both sides
+    of images.
 
     Returns:
         The change, what each gradient predicts of it, the images at both ends of the

@@ -1,5 +1,5 @@
-"""Define what a loader returns: a network ready to run, and what its file or author states
-about it.
+"""Define what a loader returns: a network ready to run, and what its file or author
+states about it.
 
 The author may be Python code: ``package.module:callable``, with weights after an ``@``.
 """
@@ -94,8 +94,8 @@ class Purpose:
             )
 
     def parse_question(self, model: str, what: str) -> tuple[bool, str | None]:
-        """Return whether a network that returns texts answers freely, and the user's question, None
-        for the default.
+        """Return whether a network that returns texts answers freely, and the user's
+        question, None for the default.
 
         Raises:
             ModelError: as `check`.

@@ -196,7 +196,7 @@ def _select_points(count: int) -> npt.NDArray[np.int_]:
     return np.unique(positions.round().astype(int))
 
 
-def _as_dots(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _as_dots(values: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
     """Return coordinates (3n,) of lines without a length at values (n,), with gaps."""
     return np.stack([values, values, values * np.nan], 1).ravel()
 
@@ -353,7 +353,9 @@ def _make_map_panels(
 
 
 def _corners(box: Box, factor: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return the first and last pixels of a box in the magnified image, inside of it."""
+    """Return the first and last pixels of a box in the magnified image, inside of
+    it.
+    """
     x0, y0, x1, y1 = (round(bound * factor) for bound in box)
     width, height = size
     left = min(max(x0, 0), width - 1)

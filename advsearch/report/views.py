@@ -190,7 +190,9 @@ def shown(result: Result) -> ShownResult:
 
 
 def remarks_of(result: Result, view: ShownResult) -> list[str]:
-    """Return what to know of a result before it is used: its state, cautions, warnings."""
+    """Return what to know of a result before it is used: its state, cautions,
+    warnings.
+    """
     ending = getattr(result, "ending", "")
     remarks = []
     if ending == INTERRUPTED and not view.says_interrupted:
@@ -552,7 +554,9 @@ class InNotebook:
 def result_html(
     view: ShownResult, pictures: Mapping[str, ArrayLike] | None = None
 ) -> str:
-    """Return a result as HTML for a notebook: its sentence, pictures, figure, tables."""
+    """Return a result as HTML for a notebook: its sentence, pictures, figure,
+    tables.
+    """
     figures = []
     for name, image in (pictures or {}).items():
         picture = _picture(png_bytes(image), SHOWN, name)

@@ -234,7 +234,8 @@ def wanted(objective: str, thing: str) -> str:
 def prediction_cells(task: str, prediction: Said) -> list[str]:
     """Return a prediction and its number, for a table.
 
-    For instance ``["vase", "84 %"]`` and ``["no cup found", "best score of cup 0.12"]``.
+    For instance ``["vase", "84 %"]`` and ``["no cup found", "best score of cup
+    0.12"]``.
     """
     label = prediction.label
     probability = prediction.probability

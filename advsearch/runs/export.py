@@ -295,7 +295,9 @@ def _import_values(record: JsonObject) -> dict[str, Value]:
         "object": _value(record.get("model")),
         "environment": _value(record.get("environment")),
     }
-    for name, value in record["render_args"].items():
+    render_args = record["render_args"]
+    assert isinstance(render_args, dict)
+    for name, value in render_args.items():
         if isinstance(value, list):
             for index, component in enumerate(value):
                 values[f"{name}[{index}]"] = _value(component)

@@ -301,7 +301,9 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
 
 
 def _digest_folder(folder: Path, pattern: str) -> str:
-    """Return one SHA-256 of the names and contents of the files that match a pattern."""
+    """Return one SHA-256 of the names and contents of the files that match a
+    pattern.
+    """
     paths = sorted(islice(folder.glob(pattern), MOST_FILES))
     lines = [
         f"{path.relative_to(folder).as_posix()}\n{_digest(path)}"

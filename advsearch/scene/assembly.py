@@ -149,9 +149,9 @@ class Assembly:
     """Turn the inputs of a space into those of `MitsubaScene`, for a scene's parts.
 
     Attributes:
-        is_object_hidden: put the object so far away that neither it nor its shadow is in the image.
-            The bounds of a scene in which this was set once change the last bits of
-            every later image: use it for such images alone.
+        is_object_hidden: put the object so far away that neither it nor its shadow is
+            in the image. The bounds of a scene in which this was set once change the
+            last bits of every later image: use it for such images alone.
     """
 
     is_object_hidden = False

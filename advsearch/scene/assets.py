@@ -240,12 +240,15 @@ class EnvironmentAsset:
     place: Any = None
 
     def __post_init__(self) -> None:
-        """Check the radiance. Raises InputError: a texel is negative, NaN or infinite."""
+        """Check the radiance. Raises InputError: a texel is negative, NaN or
+        infinite.
+        """
         is_bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
         if is_bad.any():
             row, column = np.unravel_index(int(is_bad.argmax()), is_bad.shape)
             description = (
-                f"{int(is_bad.sum())} of {is_bad.size} texels that are negative, NaN or "
+                f"{int(is_bad.sum())} of {is_bad.size} texels that are negative, NaN "
+                "or "
                 "infinite"
             )
             raise InputError(
@@ -264,7 +267,9 @@ def compute_area_vectors(corners: Float64Array) -> Float64Array:
 
 
 def make_pose(linear: npt.ArrayLike, translation: npt.ArrayLike) -> Float64Array:
-    """Return the pose (4, 4) `linear @ v + place` of a matrix (3, 3) and a shift (3,)."""
+    """Return the pose (4, 4) `linear @ v + place` of a matrix (3, 3) and a shift
+    (3,).
+    """
     pose = np.eye(4)
     pose[:3, :3] = linear
     pose[:3, 3] = translation
@@ -497,7 +502,8 @@ def with_size(asset: ObjectAsset, size: float | None, unit: str | None) -> Objec
             else (f"unit={unit} for a mesh of {asset.extent:.4g}")
         )
         raise InputError(
-            f"{statement}: expected a longest side of {MIN_METRES:g} to {MAX_METRES:g} metres, "
+            f"{statement}: expected a longest side of {MIN_METRES:g} to {MAX_METRES:g} "
+            "metres, "
             f"got {metres:.4g}; give it in "
             "metres, such as size=4.9"
         )

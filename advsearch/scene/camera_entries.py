@@ -31,7 +31,9 @@ IMAGE_CHANGING_KEYS = re.compile(
     r".*coeff.*|.*flip.*|.*rotate.*|image(rotation|scale)|scale(factor)?|resize.*|(is|image)?rectified|"
     r".*roi.*|.*crop.*|.*binning.*|.*decimat.*|.*fisheye.*|.*lens.*model|.*poly.*|.*affine.*|.*projectionparam.*"
 )
-"""Plain names of entries that change the image, and are rejected unless they are read."""
+"""Plain names of entries that change the image, and are rejected unless they are
+read.
+"""
 # Plain names of entries about rectified images.
 RECTIFICATION_KEYS = re.compile(r"r|p|rectificationmatrix|projectionmatrix")
 IGNORED_KEYS = re.compile(
@@ -69,7 +71,8 @@ class Entries:
         for first in self._keys.repeated:
             other = self._keys.get_spelling(normalize_key(first))
             raise FileFormatError(
-                f"{path}: has {format_name(first)} and {format_name(other)}; leave one of them out"
+                f"{path}: has {format_name(first)} and {format_name(other)}; leave one "
+                "of them out"
             )
         # Keys of matrices that are not read.
         self._unread_matrix_keys: list[str] = []
@@ -139,7 +142,8 @@ class Entries:
         return [parse_number(self.path, name, value) for value in values]
 
     def find_unread(self, prefix: str = "") -> list[str]:
-        """Return the entries that were not read and need a note, as the file spells them.
+        """Return the entries that were not read and need a note, as the file spells
+        them.
 
         Args:
             prefix: prefix for the entry that they are within, with a dot.
@@ -281,8 +285,8 @@ def make_camera_model(
         kind: the kind of model.
         size: height and width of the image.
         pixel_values: numbers by their names in `NUMBER_NAMES`; 0 by default.
-        pixel_offset: coordinate that the file's principal point needs added to count from the
-            corner of the image.
+        pixel_offset: coordinate that the file's principal point needs added to count
+            from the corner of the image.
 
     Raises:
         FileFormatError: no camera has such numbers.
@@ -389,7 +393,7 @@ PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
 """The mounted cameras by name."""
 TABLE_HEIGHT = 0.75
 TABLE_SIDE = 1.2
-"""Height and side in metres of a table of a bundled room, on which objects stand that are
-no larger than `MAX_TABLETOP_SIZE`.
+"""Height and side in metres of a table of a bundled room, on which objects stand that
+are no larger than `MAX_TABLETOP_SIZE`.
 """
 MAX_TABLETOP_SIZE = 0.5  # metres of the longest side

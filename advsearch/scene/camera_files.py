@@ -147,9 +147,18 @@ SCENE_KEYS = frozenset(
     "file_path transform_matrix sharpness colmap_im_id mask_path depth_file_path "
     "semantic_path time rotation".split()
 )
-"""Entries of a transforms.json, and of its frames, that are not about the lens; angles are
-used if focal lengths are missing.
+"""Entries of a transforms.json, and of its frames, that are not about the lens; angles
+are used if focal lengths are missing.
 """
+
+
+def _list_lines(text: str) -> list[str]:
+    """Return the lines of a text that are neither blank nor comments."""
+    return [
+        line
+        for line in text.splitlines()
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
 
 
 def read_camera(spec: str) -> CameraModel:
@@ -177,11 +186,7 @@ def read_camera(spec: str) -> CameraModel:
         )
     limit = MAX_JSON_SIZE if suffix == ".json" else LARGEST
     text = present_text(path, "a camera file", limit)
-    lines = [
-        line
-        for line in text.splitlines()
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+    lines = _list_lines(text)
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
         return _read_colmap(spec, path, which, lines)
     check_text_format(path, text)
@@ -198,9 +203,8 @@ def read_camera(spec: str) -> CameraModel:
     }
     if cameras:
         rest = {name: entry for name, entry in data.items() if name not in cameras}
-        unread = Entries(path, rest)
         camera = Entries(path, select_camera(path, which, cameras))
-        return _read_kalibr(spec, camera, unread.find_unread())
+        return _read_kalibr(spec, camera, Entries(path, rest).find_unread())
     if which:
         raise FileFormatError(
             f"{path}: expected several cameras, as {which!r} is asked for, got one; "
@@ -320,30 +324,71 @@ def _read_nerfstudio(
 ) -> CameraModel:
     """Return the model of a transforms.json, or of one of its frames."""
     path = spec.partition("#")[0]
-    frames = data.get("frames") or []
-    if not isinstance(frames, list):
-        frames = []
-    frames = [frame for frame in frames if isinstance(frame, dict)]
+    frames = _list_frames(data)
     lens = _select_lens(path, camera_name, frames)
-    frame_rest = {}
-    for frame in frames:
-        for key, value in frame.items():
-            if key not in LENS_KEYS | SCENE_KEYS:
-                frame_rest[key] = value
     scene_entries = {key: value for key, value in data.items() if key not in SCENE_KEYS}
     entries = Entries(path, scene_entries | lens)
     width = entries.get_number("w")
     height = entries.get_number("h")
+    kind = _read_projection(path, entries)
+    numbers = _read_focal_lengths(path, data, entries, width, height)
+    numbers["cx"] = entries.get_number("cx", width / 2.0)
+    numbers["cy"] = entries.get_number("cy", height / 2.0)
+    if kind == FISHEYE:
+        numbers |= _read_coefficients(entries, COEFFICIENTS[:4])
+    else:
+        numbers |= _read_coefficients(entries, ("k1", "k2", "k3", "p1", "p2"))
+    model = make_camera_model(spec, kind, (height, width), numbers)
+    unread = entries.find_unread()
+    frame_entries = Entries(path, _select_other_entries(frames))
+    return add_notes(model, [*unread, *frame_entries.find_unread("frames.")])
+
+
+def _list_frames(data: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the frames of a transforms.json; none if they are malformed."""
+    frames = data.get("frames") or []
+    if not isinstance(frames, list):
+        return []
+    return [frame for frame in frames if isinstance(frame, dict)]
+
+
+def _select_other_entries(frames: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the entries of frames that are about neither the lens nor the scene."""
+    other_entries = {}
+    for frame in frames:
+        for key, value in frame.items():
+            if key not in LENS_KEYS | SCENE_KEYS:
+                other_entries[key] = value
+    return other_entries
+
+
+def _read_projection(path: str, entries: Entries) -> str:
+    """Return the kind of a camera model by nerfstudio's entries.
+
+    Raises:
+        FileFormatError: the model is not one of ours.
+    """
     name = str(entries.get("cameramodel") or "PINHOLE").upper()
     if name not in (*COLMAP_MODELS, "PERSPECTIVE"):
         raise FileFormatError(
-            f"{path}: expected one of the camera models {', '.join(COLMAP_MODELS)}, got "
+            f"{path}: expected one of the camera models {', '.join(COLMAP_MODELS)}, "
+            "got "
             f"{format_name(name)}, which is another "
             "projection; fit one of these to it"
         )
-    kind = COLMAP_MODELS[name][0] if name in COLMAP_MODELS else BROWN_CONRADY
     if entries.get("isfisheye"):
-        kind = FISHEYE
+        return FISHEYE
+    return COLMAP_MODELS[name][0] if name in COLMAP_MODELS else BROWN_CONRADY
+
+
+def _read_focal_lengths(
+    path: str, data: Mapping[str, Any], entries: Entries, width: float, height: float
+) -> dict[str, float]:
+    """Return fx and fy in pixels, from lengths or from angles of view.
+
+    Raises:
+        FileFormatError: the two contradict each other.
+    """
     x_focal = _compute_focal_length(path, data.get("camera_angle_x"), width)
     y_focal = _compute_focal_length(path, data.get("camera_angle_y"), height)
     fx = entries.get_number("fl_x", x_focal or None)
@@ -352,16 +397,7 @@ def _read_nerfstudio(
             f"{path}: fl_x: expected {x_focal:g}, as camera_angle_x says, got {fx:g}; "
             "leave one out"
         )
-    numbers = {"fx": fx, "fy": entries.get_number("fl_y", y_focal or fx)}
-    numbers["cx"] = entries.get_number("cx", width / 2.0)
-    numbers["cy"] = entries.get_number("cy", height / 2.0)
-    names: Sequence[str] = ("k1", "k2", "k3", "p1", "p2")
-    if kind == FISHEYE:
-        names = COEFFICIENTS[:4]
-    numbers |= _read_coefficients(entries, names)
-    model = make_camera_model(spec, kind, (height, width), numbers)
-    unread = [*entries.find_unread(), *Entries(path, frame_rest).find_unread("frames.")]
-    return add_notes(model, unread)
+    return {"fx": fx, "fy": entries.get_number("fl_y", y_focal or fx)}
 
 
 def _select_lens(
@@ -390,7 +426,9 @@ def _compute_focal_length(path: str, angle: object, side: float) -> float:
 def _read_kalibr(
     spec: str, entries: Entries, unread: Sequence[str] = ()
 ) -> CameraModel:
-    """Return the model of a camera of Kalibr; `unread` are other entries of its file."""
+    """Return the model of a camera of Kalibr; `unread` are other entries of its
+    file.
+    """
     path = entries.path
     model = str(entries.get("cameramodel") or "pinhole")
     if model != "pinhole":
@@ -526,7 +564,9 @@ def _read_coefficients(entries: Entries, names: Sequence[str]) -> dict[str, floa
 
 
 def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
-    """Return the names of matrices of rectified images that differ from the camera's."""
+    """Return the names of matrices of rectified images that differ from the
+    camera's.
+    """
     fx, skew, cx, _, fy, cy = matrix[:6]
     differing = []
     for name, short_name, expected in (

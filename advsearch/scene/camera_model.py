@@ -23,7 +23,7 @@ the focal lengths: an image of another size is the same one, scaled.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -64,8 +64,8 @@ class CameraModel:
     """Intrinsics and distortion of a camera."""
 
     kind: str  # `BROWN_CONRADY`, `FISHEYE` or `EQUIRECTANGULAR`
-    # (17,) in the order of `NUMBER_NAMES`: fx, cx and skew in image widths, fy and cy in
-    # image heights, the coefficients.
+    # (17,) in the order of `NUMBER_NAMES`: fx, cx and skew in image widths, fy and cy
+    # in image heights, the coefficients.
     numbers: tuple[float, ...]
     # The user's name for it: a file, or a bundled model; empty if `camera.fov` sets its
     # focal length.
@@ -109,22 +109,34 @@ class CameraModel:
             # All but NaN are visible.
             return _project_to_panorama(x, y, z), x == x
         if self.kind == FISHEYE:
-            distance = torch.hypot(x, y)
-            angle = torch.atan2(distance, z)
-            scale = self._distort_radius(angle) / distance.clamp_min(1e-300)
-            is_visible = angle <= self._max_visible
-            distorted = torch.stack([x * scale, y * scale], dim=-1)
+            distorted, is_visible = self._project_fisheye(x, y, z)
         else:
-            depth = torch.where(z > 0.0, z, torch.ones_like(z))
-            undistorted = torch.stack([x / depth, y / depth], dim=-1)
-            radius = undistorted.norm(dim=-1)
-            is_visible = (z > 0.0) & (radius <= self._max_visible)
-            distorted = self._distort(undistorted)
+            distorted, is_visible = self._project_perspective(x, y, z)
         (fx, fy, cx, cy, skew) = self.numbers[: len(LINEAR_PARAMETERS)]
         (x, y) = distorted.unbind(dim=-1)
         column = fx * x + skew * y + cx
         row = fy * y + cy
         return torch.stack([column, row], dim=-1), is_visible
+
+    def _project_fisheye(
+        self, x: Tensor, y: Tensor, z: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return distorted tangents (N, 2) of points, and which are visible."""
+        distance = torch.hypot(x, y)
+        angle = torch.atan2(distance, z)
+        scale = self._distort_radius(angle) / distance.clamp_min(1e-300)
+        distorted = torch.stack([x * scale, y * scale], dim=-1)
+        return distorted, angle <= self._max_visible
+
+    def _project_perspective(
+        self, x: Tensor, y: Tensor, z: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return distorted tangents (N, 2) of points, and which are visible."""
+        depth = torch.where(z > 0.0, z, torch.ones_like(z))
+        undistorted = torch.stack([x / depth, y / depth], dim=-1)
+        radius = undistorted.norm(dim=-1)
+        is_visible = (z > 0.0) & (radius <= self._max_visible)
+        return self._distort(undistorted), is_visible
 
     def compute_rays(self, image_points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rays of image coordinates (N, 2).
@@ -171,7 +183,9 @@ class CameraModel:
         return directions, _clip_margin(max_radius - radius, converged)
 
     def _to_distorted(self, u: Tensor, v: Tensor) -> Tensor:
-        """Return distorted points (N, 2) at image coordinates (N,): invert `LINEAR_PARAMETERS`."""
+        """Return distorted points (N, 2) at image coordinates (N,): invert
+        `LINEAR_PARAMETERS`.
+        """
         fx, fy, cx, cy, skew = self.numbers[: len(LINEAR_PARAMETERS)]
         y = (v - cy) / fy
         return torch.stack([(u - cx - skew * y) / fx, y], dim=-1)
@@ -240,22 +254,14 @@ class CameraModel:
         for _ in range(MAX_STEPS // 3):
             values, rows = _evaluate_with_jacobian(self._distort, undistorted)
             error = values - distorted
-            (a, b), (c, d) = (row.unbind(dim=-1) for row in rows)
-            determinant = a * d - b * c
+            step, determinant = _solve_two_by_two(rows, error)
             is_inside = (determinant > 0.0) & (undistorted.norm(dim=-1) < max_radius)
             converged = is_inside & (
                 error.norm(dim=-1) <= TOLERANCE * (1.0 + distorted.norm(dim=-1))
             )
             if bool(converged.all()):
                 break
-            safe_determinant = torch.where(
-                determinant.abs() > 1e-12,
-                determinant,
-                torch.full_like(determinant, 1e-12),
-            )
-            x, y = error.unbind(dim=-1)
-            step = torch.stack([d * x - b * y, a * y - c * x], dim=-1)
-            updated = undistorted - step / safe_determinant[..., None]
+            updated = undistorted - step
             radius = updated.norm(dim=-1, keepdim=True)
             updated = torch.where(
                 torch.isfinite(radius),
@@ -408,7 +414,8 @@ class CameraModel:
         sentence = f"{name}: {black_part} lies outside the lens's circle and is black."
         if self.fold_angle < math.radians(self.max_angle):
             sentence = (
-                f"{name}: the lens folds at {math.degrees(self.fold_angle):.1f} degrees "
+                f"{name}: the lens folds at {math.degrees(self.fold_angle):.1f} "
+                "degrees "
                 f"from its axis, and {black_part}, which only directions beyond that "
                 "would fill, is black."
             )
@@ -462,6 +469,29 @@ def make_bundled_models(aspect: float = 1.0) -> Mapping[str, CameraModel]:
         FISHEYE: CameraModel(FISHEYE, fisheye, FISHEYE, max_angle=90.0),
         EQUIRECTANGULAR: CameraModel(EQUIRECTANGULAR, panorama, EQUIRECTANGULAR),
     }
+
+
+def _solve_two_by_two(rows: Sequence[Tensor], right: Tensor) -> tuple[Tensor, Tensor]:
+    """Solve linear systems of two equations by Cramer's rule.
+
+    Args:
+        rows: the two rows (N, 2) of the matrices.
+        right: (N, 2), their right sides.
+
+    Returns:
+        The solutions (N, 2), large where a matrix is nearly singular; and the
+        determinants (N,).
+    """
+    (a, b), (c, d) = (row.unbind(dim=-1) for row in rows)
+    determinant = a * d - b * c
+    safe_determinant = torch.where(
+        determinant.abs() > 1e-12,
+        determinant,
+        torch.full_like(determinant, 1e-12),
+    )
+    x, y = right.unbind(dim=-1)
+    numerator = torch.stack([d * x - b * y, a * y - c * x], dim=-1)
+    return numerator / safe_determinant[..., None], determinant
 
 
 def _project_to_panorama(x: Tensor, y: Tensor, z: Tensor) -> Tensor:

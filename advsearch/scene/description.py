@@ -189,13 +189,13 @@ class SceneDescription:
         """Return the scene as one of its cameras sees it, or through another lens.
 
         Args:
-            camera: name of a camera of the scene, or of a mounted one; or, for the camera
-                around the object, the path of a camera file or the name of a bundled camera
-                model.
+            camera: name of a camera of the scene, or of a mounted one; or, for the
+                camera around the object, the path of a camera file or the name of a
+                bundled camera model.
 
         Raises:
-            InputError: a setting of the camera around the object was given, and another is
-                to see it; or a file cannot be used.
+            InputError: a setting of the camera around the object was given, and another
+                is to see it; or a file cannot be used.
             UnknownNameError: it has no such camera.
         """
         if camera in PRESETS and camera not in self.cameras:
@@ -210,7 +210,8 @@ class SceneDescription:
         )
         if camera != ORBIT_CAMERA and camera_settings:
             raise InputError(
-                f"`camera={camera}` and `set` {camera_settings[0]} contradict each other: "
+                f"`camera={camera}` and `set` {camera_settings[0]} contradict each "
+                "other: "
                 "the camera of the file has a place and "
                 "a field of view of its own; leave one of the two out"
             )
@@ -416,7 +417,9 @@ class SceneDescription:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how the scene was read, and remarks of controls."""
+        """What a user should know of how the scene was read, and remarks of
+        controls.
+        """
         light_notes = () if self.environment is None else self.environment.warnings
         camera_notes = () if self.camera_model is None else self.camera_model.notes
         size_remarks = describe_size_doubts(
@@ -512,7 +515,9 @@ class SceneDescription:
 
     @property
     def requested_values(self) -> dict[str, float | str]:
-        """The settings that were requested, as users write them: a choice by its name."""
+        """The settings that were requested, as users write them: a choice by its
+        name.
+        """
         requested: dict[str, float | str] = {}
         for name in self.requested & self.values.keys():
             value = self.values[name]
@@ -782,9 +787,11 @@ def check_single_environment(parts: Iterable[ScenePart], requester: str) -> None
     for part in parts:
         if isinstance(part, PluginPart) and part.plugin.get("type") in ENVIRONMENTS:
             raise InputError(
-                f"{requester}: the Mitsuba scene has an environment of its own, {part.name} "
+                f"{requester}: the Mitsuba scene has an environment of its own, "
+                f"{part.name} "
                 f"(a {part.plugin['type']}), and "
-                f"there can be one only; leave {requester} out, or take {part.name} out of "
+                f"there can be one only; leave {requester} out, or take {part.name} "
+                "out of "
                 "the scene"
             )
 

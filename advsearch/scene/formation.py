@@ -205,8 +205,8 @@ NO_OMISSIONS: frozenset[str] = frozenset()
 # would need a render.
 #
 # The meter is held with camera, pose and rotation of the environment as they are by
-# default, and then does not change. So a configuration has the same exposure whether its
-# camera is a setting, a control's fixed value or a point of a grid.
+# default, and then does not change. So a configuration has the same exposure whether
+# its camera is a setting, a control's fixed value or a point of a grid.
 #
 #     E(n) = integral over directions w of L(w) max(n . w, 0),    L(w) = albedo / pi
 # E(up) where w ends on the ground
@@ -231,7 +231,8 @@ METERED_DEFAULTS = ("camera.", "pose.", "environment.")
 
 @lru_cache(maxsize=8)
 def compute_metered_gain(scene: SceneDescription) -> float:
-    """Return the factor on radiance that gives the metered white card `CARD_DISPLAY_VALUE`.
+    """Return the factor on radiance that gives the metered white card
+    `CARD_DISPLAY_VALUE`.
 
     Where the camera sees nothing of the object, the card lies on the ground; where no
     light arrives the factor is 1.
@@ -280,12 +281,9 @@ def compute_irradiance(scene: SceneDescription, normals: Float64Array) -> Float6
     for name in scene.surrounding_meshes:
         part = scene.meshes[name]
         if part.emission is not None:
-            face_directions, face_power = _compute_emitted_light(
-                part, part.emission, center
-            )
-            cosines = np.maximum(np.einsum("nk,fk->nf", normals, face_directions), 0.0)
-            emitted = np.einsum("nf,fc->nc", cosines, face_power)
-            irradiances = irradiances + emitted
+            directions, power = _compute_emitted_light(part, part.emission, center)
+            cosines = np.maximum(np.einsum("nk,fk->nf", normals, directions), 0.0)
+            irradiances = irradiances + np.einsum("nf,fc->nc", cosines, power)
     return irradiances
 
 
@@ -351,6 +349,24 @@ def _compute_emitted_light(
     return direction, mean * (projected_area / disk)[:, None]
 
 
+def _choose_metering_shape(frame: Frame) -> tuple[float, tuple[int, int]]:
+    """Return the width of a pixel of a small image, as a tangent, and its shape."""
+    width = frame.right - frame.left
+    height = frame.high - frame.low
+    pixel = max(width, height) / METERING_SIZE
+    return pixel, (round(height / pixel), round(width / pixel))
+
+
+def _find_nearest(
+    nearness: Float64Array, row: IntArray, column: IntArray, shape: tuple[int, int]
+) -> IntArray:
+    """Return the index of the nearest sample in each pixel that has one."""
+    order = np.argsort(nearness, kind="stable")
+    front = np.full(shape, -1)
+    front[row[order], column[order]] = order  # the nearest comes last
+    return np.asarray(front[front >= 0])
+
+
 def compute_visible_normals(scene: SceneDescription) -> Float64Array:
     """Return the unit normals (N, 3) of the object in the pixels of a small image.
 
@@ -361,36 +377,46 @@ def compute_visible_normals(scene: SceneDescription) -> Float64Array:
     faces = scene.object.mesh.faces.astype(np.int64)
     faces = faces[(points[faces][..., 2] > MIN_DEPTH).all(axis=1)]
     frame = Frame.of(scene.number("camera.fov"), scene.aspect)
-    width = frame.right - frame.left
-    height = frame.high - frame.low
-    pixel = max(width, height) / METERING_SIZE
-    shape = (round(height / pixel), round(width / pixel))
+    pixel, shape = _choose_metering_shape(frame)
     tangents = points[faces][..., :2] / points[faces][..., 2:]
     face, row, column, weights = rasterize_triangles(
         (tangents - (frame.left, frame.low)) / pixel - 0.5, shape
     )
     # 1 / depth is linear in the image
     nearness = (weights / points[faces[face]][..., 2]).sum(axis=1)
-    order = np.argsort(nearness, kind="stable")
-    front = np.full(shape, -1)
-    front[row[order], column[order]] = order  # the nearest comes last
-    visible = front[front >= 0]
+    visible = _find_nearest(nearness, row, column, shape)
 
     corners = faces[face[visible]]
-    linear = object_to_world(scene)[:3, :3]
-    object_normals = scene.object.mesh.normals[corners]
-    normals = (weights[visible, :, None] * object_normals).sum(axis=1) @ linear.T
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    normals = _interpolate_normals(scene, corners, weights[visible])
     from_camera = points[corners].mean(axis=1) @ camera[:3, :3].T
     is_back_facing = (normals * from_camera).sum(axis=1, keepdims=True) > 0.0
     return np.asarray(np.where(is_back_facing, -normals, normals))
+
+
+def _interpolate_normals(
+    scene: SceneDescription, corners: IntArray, weights: Float64Array
+) -> Float64Array:
+    """Return unit normals (N, 3) in world space of points on the object's faces.
+
+    Args:
+        scene: with the object.
+        corners: (N, 3) vertices of the face that each point is on.
+        weights: (N, 3) of the corners.
+    """
+    normals = (weights[:, :, None] * scene.object.mesh.normals[corners]).sum(axis=1)
+    normals = normals @ object_to_world(scene)[:3, :3].T
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return np.asarray(normals)
 
 
 @lru_cache(maxsize=8)
 def _compute_unrotated_light(
     environment: EnvironmentAsset | None,
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return an environment's light as `compute_environment_light` does, without its rotation; z up."""
+    """Return an environment's light without its rotation; z is up.
+
+    The results are those of `compute_environment_light`.
+    """
     if environment is None:
         return np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
     height, width = environment.radiance.shape[:2]
@@ -405,6 +431,21 @@ def _compute_unrotated_light(
     row_sums = np.add.reduceat(fine, rows, axis=0)
     sums = np.add.reduceat(row_sums, columns, axis=1).reshape(-1, 4)
 
+    directions = _compute_block_directions(rows, columns, (height, width))
+    return directions, sums[:, 3], sums[:, :3]
+
+
+def _compute_block_directions(
+    rows: IntArray, columns: IntArray, shape: tuple[int, int]
+) -> Float64Array:
+    """Return the directions (blocks, 3) of the centers of blocks of an environment map.
+
+    Args:
+        rows: the first row of each block.
+        columns: the first column of each block.
+        shape: rows and columns of the map.
+    """
+    height, width = shape
     row_ends = np.append(rows[1:], height)
     column_ends = np.append(columns[1:], width)
     theta = (rows + row_ends - 1)[:, None] * (0.5 * math.pi / (height - 1))
@@ -412,8 +453,7 @@ def _compute_unrotated_light(
     z = np.broadcast_to(np.cos(theta), (len(rows), len(columns)))
     x = np.sin(theta) * np.cos(azimuth)
     y = np.sin(theta) * np.sin(azimuth)
-    directions = np.stack([x, y, z], axis=-1)
-    return directions.reshape(-1, 3), sums[:, 3], sums[:, :3]
+    return np.stack([x, y, z], axis=-1).reshape(-1, 3)
 
 
 def _find_block_starts(size: int, count: int) -> IntArray:

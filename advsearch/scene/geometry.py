@@ -91,6 +91,25 @@ class Frame:
         return np.asarray(corners / np.linalg.norm(corners, axis=-1, keepdims=True))
 
 
+def _compute_edge_tangents(
+    description: SceneDescription, fov: Tensor, aspect: float
+) -> Tensor:
+    """Return the tangents (2,) of the angles from the middle of an image to its
+    edges.
+    """
+    model = description.camera_model
+    if model is not None and model.name:  # of what it shows, a rectangle
+        return torch.tensor(
+            model.visible_tangents, dtype=torch.float64, device=fov.device
+        )
+    shape = torch.tensor(
+        [min(1.0, aspect), min(1.0, 1.0 / aspect)],
+        dtype=torch.float64,
+        device=fov.device,
+    )
+    return torch.tan(torch.deg2rad(fov.double()) / 2.0) * shape
+
+
 def compute_framing_distance(
     description: SceneDescription, fov: Tensor, aspect: float
 ) -> Tensor:
@@ -107,18 +126,7 @@ def compute_framing_distance(
         description.object.mesh.vertices.astype(np.float64)
         - compute_center(description)
     ).to(fov.device)
-    model = description.camera_model
-    if model is not None and model.name:  # of what it shows, a rectangle
-        edge = torch.tensor(
-            model.visible_tangents, dtype=torch.float64, device=fov.device
-        )
-    else:
-        shape = torch.tensor(
-            [min(1.0, aspect), min(1.0, 1.0 / aspect)],
-            dtype=torch.float64,
-            device=fov.device,
-        )
-        edge = torch.tan(torch.deg2rad(fov.double()) / 2.0) * shape
+    edge = _compute_edge_tangents(description, fov, aspect)
     azimuth, elevation, roll = (
         float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW
     )
@@ -389,9 +397,9 @@ def compute_car_pose(camera: Tensor) -> Tensor:
     """
     ahead = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
     zero = torch.zeros_like(ahead[0])
-    one = torch.ones_like(ahead[0])
+    unit = torch.ones_like(ahead[0])
     axes = torch.stack(
-        [ahead[0], -ahead[1], zero, ahead[1], ahead[0], zero, zero, zero, one]
+        [ahead[0], -ahead[1], zero, ahead[1], ahead[0], zero, zero, zero, unit]
     ).reshape(3, 3)
     return make_affine(axes, torch.cat([camera[:2, 3], zero[None]]))
 
@@ -427,13 +435,13 @@ def make_euler_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     Differentiable.
     """
     zero = torch.zeros_like(yaw)
-    one = torch.ones_like(yaw)
+    unit = torch.ones_like(yaw)
     (cz, sz), (cy, sy), (cx, sx) = (
         (torch.cos(a), torch.sin(a)) for a in map(torch.deg2rad, (yaw, pitch, roll))
     )
-    about_z = torch.stack([cz, -sz, zero, sz, cz, zero, zero, zero, one]).reshape(3, 3)
-    about_y = torch.stack([cy, zero, sy, zero, one, zero, -sy, zero, cy]).reshape(3, 3)
-    about_x = torch.stack([one, zero, zero, zero, cx, -sx, zero, sx, cx]).reshape(3, 3)
+    about_z = torch.stack([cz, -sz, zero, sz, cz, zero, zero, zero, unit]).reshape(3, 3)
+    about_y = torch.stack([cy, zero, sy, zero, unit, zero, -sy, zero, cy]).reshape(3, 3)
+    about_x = torch.stack([unit, zero, zero, zero, cx, -sx, zero, sx, cx]).reshape(3, 3)
     return about_z @ about_y @ about_x
 
 

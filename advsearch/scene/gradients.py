@@ -117,8 +117,8 @@ TURN_STEP = 0.005
 
 The first is that of a range, the second that of a full turn.
 """
-# motion of the fastest point of an outline in half a difference (docs/gradients.md, "The
-# estimators")
+# motion of the fastest point of an outline in half a difference (docs/gradients.md,
+# "The estimators")
 DEFAULT_PIXELS = 1.0
 STEP_RANGE = (1e-6, 0.15)  # smallest and largest step in u
 

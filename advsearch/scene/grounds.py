@@ -158,7 +158,9 @@ def is_paved(scene: SceneDescription) -> bool:
 
 
 def has_lanes(scene: SceneDescription) -> bool:
-    """Return whether the object stands in a lane, where what faces +x drives along it."""
+    """Return whether the object stands in a lane, where what faces +x drives along
+    it.
+    """
     place = find_place(scene)
     return place is not None and place.file.lane_width is not None
 
@@ -196,7 +198,9 @@ def make_traffic_remark(scene: SceneDescription) -> str:
 
 
 def is_enclosed(scene: SceneDescription) -> bool:
-    """Return whether much stands around the object: light paths seldom leave the scene."""
+    """Return whether much stands around the object: light paths seldom leave the
+    scene.
+    """
     return any(
         part.is_laid_ground and not part.is_ground
         for part in scene.surrounding_meshes.values()
@@ -404,15 +408,9 @@ def find_surroundings(scene: SceneDescription) -> Surroundings | None:
     place = find_place(scene)
     extent: Box | float = math.inf if place is None else bound_ground(place)
     bundled = PLACE_BY_GROUND_KIND.get(environment.ground or "")
-    pictured_place = (
-        environment.place if bundled is None else load_bundled_place(*bundled)
-    )
-    if (
-        place is not None
-        and pictured_place is not None
-        and pictured_place.file.picture is not None
-    ):
-        picture = pictured_place.file.picture
+    backdrop = environment.place if bundled is None else load_bundled_place(*bundled)
+    if place is not None and backdrop is not None and backdrop.file.picture is not None:
+        picture = backdrop.file.picture
         return Surroundings(
             picture.height,
             (*picture.x, *picture.y),
@@ -477,6 +475,14 @@ def get_camera_position(view: CameraView) -> Float64Array:
     )
 
 
+def _describe_views_beyond(n_beyond: int, n_views: int) -> str:
+    """Return the subject of the remark about views that are too far or too high."""
+    if n_views == 1:
+        return "the camera is"
+    percentage = 100.0 * (n_beyond / n_views)
+    return f"{percentage:.0f} % of the views are past that, up to"
+
+
 def list_view_remarks(
     scene: SceneDescription, views: Sequence[CameraView], *, rotates_map: bool = False
 ) -> tuple[str, ...]:
@@ -511,10 +517,7 @@ def list_view_remarks(
     if not beyond:
         return ()
     unit = "m" if scene.object.metres is not None else "object sizes"
-    who = "the camera is"
-    if len(views) > 1:
-        percentage = 100.0 * (len(beyond) / len(views))
-        who = f"{percentage:.0f} % of the views are past that, up to"
+    who = _describe_views_beyond(len(beyond), len(views))
     farthest = max(view.distance for view in beyond)
     highest = max(view.height for view in beyond)
     return (
@@ -544,6 +547,12 @@ def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
     return f"{distance} away{height}"
 
 
+def _describe_position(position: Float64Array) -> str:
+    """Return the coordinates of a position (3,) in metres as text."""
+    x, y, z = position
+    return f"x {x:.3g}, y {y:.3g}, z {z:.3g} m"
+
+
 def list_outside_remarks(
     scene: SceneDescription, place: Place, views: Sequence[CameraView]
 ) -> tuple[str, ...]:
@@ -565,8 +574,7 @@ def list_outside_remarks(
     box = " and ".join(
         f"{axis} {lower:g} to {upper:g} m" for axis, (lower, upper) in bounds
     )
-    x, y, z = positions[int(is_outside.argmax())]
-    first = f"x {x:.3g}, y {y:.3g}, z {z:.3g} m"
+    first = _describe_position(positions[int(is_outside.argmax())])
     which = f"the camera is outside, at {first}"
     if len(views) > 1:
         which = (

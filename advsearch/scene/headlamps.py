@@ -205,10 +205,10 @@ def _make_lamps(
         weight: of each beam, see `BeamLamp`.
     """
     if carrier == CAMERA:
-        ahead, aside, above = EGO_LAMP_POSITION
+        left_position = np.array(EGO_LAMP_POSITION)
         positions = [
-            np.array([ahead, side * aside, above]) / scene.metres
-            for side in (1.0, -1.0)
+            left_position / scene.metres,
+            left_position * [1.0, -1.0, 1.0] / scene.metres,
         ]
     else:
         part = scene.meshes[carrier]
@@ -331,9 +331,7 @@ def _make_disks(
     upper = corners.max(axis=(0, 1))
     height, height_fraction = LAMP_HEIGHTS[where]
     width = upper[1] - lower[1]
-    turn = ahead * np.linspace(0.0, 2.0 * np.pi, N_SPOKES, endpoint=False)
-    circle = np.stack([0.0 * turn, np.cos(turn), np.sin(turn)], axis=1)
-    rim = min(LAMP_RADIUS * step, 0.1 * width) * circle
+    rim = min(LAMP_RADIUS * step, 0.1 * width) * _make_circle(ahead)
     vertices = list[Float64Array]()
     for side in (1.0, -1.0):
         center_y = (lower[1] + upper[1]) / 2.0 + side * LAMP_OFFSET * width
@@ -344,10 +342,21 @@ def _make_disks(
             _find_foremost(corners, disk, upper[0]) + GLASS_OFFSET * step
         )
         vertices.append(disk)
-    spoke = np.arange(N_SPOKES)
-    disk_faces = np.stack([0 * spoke, 1 + spoke, 1 + (spoke + 1) % N_SPOKES], axis=1)
+    disk_faces = _make_disk_faces()
     faces = np.concatenate([disk_faces, (1 + N_SPOKES) + disk_faces])
     return np.concatenate(vertices), faces
+
+
+def _make_circle(ahead: float) -> Float64Array:
+    """Return points (N, 3) on a unit circle in the plane x = 0."""
+    turn = ahead * np.linspace(0.0, 2.0 * np.pi, N_SPOKES, endpoint=False)
+    return np.stack([0.0 * turn, np.cos(turn), np.sin(turn)], axis=1)
+
+
+def _make_disk_faces() -> IntArray:
+    """Return the faces (N, 3) of a disk, whose first vertex is the center."""
+    spoke = np.arange(N_SPOKES)
+    return np.stack([0 * spoke, 1 + spoke, 1 + (spoke + 1) % N_SPOKES], axis=1)
 
 
 def _find_foremost(

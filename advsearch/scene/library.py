@@ -314,12 +314,12 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     A Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or Y alone
     (grey), in half or float; see `advsearch.scene.importing.hdr`.
 
-    Maps larger than `MAX_MAP_SIZE` are averaged down, each texel weighted by the solid angle
-    that it covers, so that the light from each direction stays the same in the mean.
-    Row 0 is up; columns stay in the file's order. Raises FileFormatError: the file is
-    missing, of another kind, damaged, or lacks channels; the message names it. Raises
-    InputError: values that are negative, NaN or infinite; the message counts them and
-    gives the first position.
+    Maps larger than `MAX_MAP_SIZE` are averaged down, each texel weighted by the solid
+    angle that it covers, so that the light from each direction stays the same in the
+    mean. Row 0 is up; columns stay in the file's order. Raises FileFormatError: the
+    file is missing, of another kind, damaged, or lacks channels; the message names it.
+    Raises InputError: values that are negative, NaN or infinite; the message counts
+    them and gives the first position.
     """
     file = Path(path)
     picture = read_light(file)
@@ -347,7 +347,8 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
 def _resize_map(
     band: Callable[[int, int], Float32Array], size: tuple[int, int]
 ) -> Float32Array:
-    """Average a map down to at most `MAX_MAP_SIZE`, or repeat texels up to `MIN_MAP_SIZE`.
+    """Average a map down to at most `MAX_MAP_SIZE`, or repeat texels up to
+    `MIN_MAP_SIZE`.
 
     See `LightImage`.
     """

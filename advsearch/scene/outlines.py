@@ -107,6 +107,15 @@ def _compare_outline(
     return min(1.0, fraction), bool((~inside).any())
 
 
+def _select_camera_inputs(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the inputs that are the camera's, on the CPU and without derivatives."""
+    return {
+        key: value.detach().cpu()
+        for key, value in inputs.items()
+        if key.startswith("camera.")
+    }
+
+
 def _project_faces(
     renderer: Renderer,
     inputs: Mapping[str, Tensor],
@@ -125,22 +134,16 @@ def _project_faces(
     default_camera = torch.from_numpy(camera_to_world(description, width / height))
     camera = inputs.get("camera.to_world", default_camera).detach().double().cpu()
     points = (vertices.detach().double().cpu() - camera[:3, 3]) @ camera[:3, :3]
-    camera_inputs = {
-        key: value.detach().cpu()
-        for key, value in inputs.items()
-        if key.startswith("camera.")
-    }
-    positions, is_before = project_points(description, camera_inputs, points, size)
+    positions, is_before = project_points(
+        description, _select_camera_inputs(inputs), points, size
+    )
     model = description.camera_model
     has_seam = model is not None and model.kind == EQUIRECTANGULAR
     faces = torch.from_numpy(part.mesh.faces.astype(np.int64))
     if part.opacity is not None or has_seam or not bool(is_before[faces].all()):
         return None
-    corners: Float64Array = positions.numpy()[faces.numpy()] + (
-        width / 2.0,
-        height / 2.0,
-    )
-    return corners
+    center = (width / 2.0, height / 2.0)
+    return np.asarray(positions.numpy()[faces.numpy()] + center)
 
 
 @dataclass(frozen=True, eq=False)

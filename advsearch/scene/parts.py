@@ -158,8 +158,8 @@ class SpotLamp(_Point):
     # angle from the axis beyond which it is dark, degrees; taken to `MIN_SPOT_ANGLE` to
     # `MAX_SPOT_ANGLE`
     cutoff: float = 45.0
-    # angle up to which it shines fully, degrees; taken to at most `MAX_BEAM_FRACTION` of the
-    # other one
+    # angle up to which it shines fully, degrees; taken to at most `MAX_BEAM_FRACTION`
+    # of the other one
     beam: float = 0.0
 
     @property
@@ -185,7 +185,9 @@ class SpotLamp(_Point):
     def compute_lighting(
         self, position: Float64Array
     ) -> tuple[Float64Array, Float64Array]:
-        """Return the vector (3,) from a position to the lamp, and its irradiance (3,)."""
+        """Return the vector (3,) from a position to the lamp, and its irradiance
+        (3,).
+        """
         to_lamp, irradiance = super().compute_lighting(position)
         cutoff, beam = self.cone
         distance = max(float(np.linalg.norm(to_lamp)), 1e-12)
@@ -257,7 +259,9 @@ class BeamLamp(ScenePart):
     def compute_lighting(
         self, position: Float64Array
     ) -> tuple[Float64Array, Float64Array]:
-        """Return the vector (3,) from a position to the lamp, and its irradiance (3,)."""
+        """Return the vector (3,) from a position to the lamp, and its irradiance
+        (3,).
+        """
         to_lamp = self.to_world[:3, 3] - position
         aside, up, ahead = -to_lamp @ self.to_world[:3, :3]
         height, width = self.table.shape

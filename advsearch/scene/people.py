@@ -13,9 +13,9 @@ z up), from the pelvis outwards. The lowest point stands on the ground.
 
 Walking adds the mean angles of a gait over its cycle, as measured of adults (Winter
 1991, "The Biomechanics and Motor Control of Human Gait", chapter 2), rounded, by a
-Fourier series. A body with other proportions would hover with its standing foot, or drag
-the other through the ground. So the legs are stretched or shortened a little, between
-hip and ankle, until each foot in stance touches the ground.
+Fourier series. A body with other proportions would hover with its standing foot, or
+drag the other through the ground. So the legs are stretched or shortened a little,
+between hip and ankle, until each foot in stance touches the ground.
 """
 
 from __future__ import annotations
@@ -77,7 +77,8 @@ WALK = (
     _body_parameter("walk", "degrees", -3600.0, 3600.0, 0.0, "Phase of a walk: the left heel "
                                                       "strikes at 0, the right at 180.",
              (0.0, 360.0), periodic=True),
-    _body_parameter("stride", "1", 0.0, 1.3, 0.0, "How far the walk swings: 0 stands, 1 is an "
+    _body_parameter("stride", "1", 0.0, 1.3, 0.0, "How far the walk swings: 0 stands, "
+                                                  "1 is an "
                                            "ordinary step.", (0.0, 1.0)),
 )  # fmt: skip
 SPINE = (
@@ -112,7 +113,8 @@ GAIT = {
     "shoulder": (-20, -17, -8, 4, 14, 18, 15, 6, -6, -16),
     "elbow": (8, 10, 15, 22, 27, 30, 27, 22, 15, 10),
 }
-"""Mean angles in degrees at each tenth of a cycle from the heel strike of the same side.
+"""Mean angles in degrees at each tenth of a cycle from the heel strike of the same
+side.
 
 The hip's are those of the thigh against the vertical: 9 degrees less than against the
 pelvis, which is tilted ahead.
@@ -129,7 +131,9 @@ STRAIGHT = {
     "upperarm": ("lowerarm", (0.02, 0.15, -1.0)), "lowerarm": ("hand", (0.16, 0.05, -1.0)),
     "thigh": ("calf", (0.0, 0.03, -1.0)), "calf": ("foot", (-0.03, 0.0, -1.0)),
 }  # fmt: skip
-"""For each bone the joint at its end, and its direction with all angles 0 on the left."""
+"""For each bone the joint at its end, and its direction with all angles 0 on the
+left.
+"""
 
 
 class Person:
@@ -234,15 +238,8 @@ class Person:
             shoe_points = skin_points(points[shoe], weights[shoe], turns, shifts)
             lowest[side] = shoe_points[:, 2].amin()
             contact[side] = compute_contact(number["walk"] + phase_shift)
-        ground = (contact["l"] * lowest["l"] + contact["r"] * lowest["r"]) / (
-            contact["l"] + contact["r"]
-        )
         amount = (number["stride"] / FULL_CONTACT_STRIDE).clamp(max=1.0)
-        raised = dict[str, Tensor]()
-        for side, height in lowest.items():
-            clearance = (height - ground).clamp(min=0.0) * (1.0 - contact[side])
-            raised[side] = amount * (ground + clearance - height)
-        return raised
+        return _correct_heights(lowest, contact, amount)
 
     def _correct_legs(
         self,
@@ -252,7 +249,9 @@ class Person:
         joints: Tensor,
         raised: Mapping[str, Tensor],
     ) -> Tensor:
-        """Return posed points (P, 3) with feet risen, and legs stretched in proportion."""
+        """Return posed points (P, 3) with feet risen, and legs stretched in
+        proportion.
+        """
         weights = self._get_tensor("weights", posed.device)
         rise = torch.zeros_like(posed[:, 2])
         for side, foot_rise in raised.items():
@@ -460,6 +459,26 @@ def skin_points(
     )
 
 
+def _correct_heights(
+    lowest: Mapping[str, Tensor], contact: Mapping[str, Tensor], amount: Tensor
+) -> dict[str, Tensor]:
+    """Return how much each foot has to rise to touch the ground.
+
+    Args:
+        lowest: height of the lowest point of each foot, "l" and "r".
+        contact: of each foot with the ground, 0 to 1.
+        amount: () fraction of the correction that is made.
+    """
+    ground = (contact["l"] * lowest["l"] + contact["r"] * lowest["r"]) / (
+        contact["l"] + contact["r"]
+    )
+    raised = dict[str, Tensor]()
+    for side, height in lowest.items():
+        clearance = (height - ground).clamp(min=0.0) * (1.0 - contact[side])
+        raised[side] = amount * (ground + clearance - height)
+    return raised
+
+
 def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return each bone's turn (3, 3) against its parent, of joint angles in degrees."""
     # The back bends in three equal parts, neck and head share the nod.
@@ -481,20 +500,35 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
         "neck_01": nod,
         "head": nod,
     }
-    for side_name, sign in (("left", 1.0), ("right", -1.0)):
-        limb = {joint: angle[f"{side_name}_{joint}"] for joint, *_ in LIMBS}
-        suffix = side_name[0]
-        raised = rotation_about("x", sign * limb["shoulder_out"]) @ rotation_about(
-            "y", -limb["shoulder"]
-        )
-        shoulder_turn = rotation_about("z", -sign * limb["shoulder_turn"])
-        turns[f"upperarm_{suffix}"] = raised @ shoulder_turn
-        turns[f"lowerarm_{suffix}"] = rotation_about("y", -limb["elbow"])
-        turns[f"thigh_{suffix}"] = rotation_about(
-            "x", sign * limb["hip_out"]
-        ) @ rotation_about("y", -limb["hip"])
-        turns[f"calf_{suffix}"] = rotation_about("y", limb["knee"])
-        turns[f"foot_{suffix}"] = rotation_about("y", -limb["ankle"])
+    turns |= _compute_limb_turns(angle, "left", 1.0)
+    turns |= _compute_limb_turns(angle, "right", -1.0)
+    return turns
+
+
+def _compute_limb_turns(
+    angle: Mapping[str, Tensor], side: str, sign: float
+) -> dict[str, Tensor]:
+    """Return the turns (3, 3) of the bones of arm and leg of a side.
+
+    Args:
+        angle: of joints, degrees.
+        side: "left" or "right".
+        sign: 1 for the left, -1 for the right, which is its mirror image.
+    """
+    limb = {joint: angle[f"{side}_{joint}"] for joint, *_ in LIMBS}
+    suffix = side[0]
+    turns = dict[str, Tensor]()
+    raised = rotation_about("x", sign * limb["shoulder_out"]) @ rotation_about(
+        "y", -limb["shoulder"]
+    )
+    shoulder_turn = rotation_about("z", -sign * limb["shoulder_turn"])
+    turns[f"upperarm_{suffix}"] = raised @ shoulder_turn
+    turns[f"lowerarm_{suffix}"] = rotation_about("y", -limb["elbow"])
+    turns[f"thigh_{suffix}"] = rotation_about(
+        "x", sign * limb["hip_out"]
+    ) @ rotation_about("y", -limb["hip"])
+    turns[f"calf_{suffix}"] = rotation_about("y", limb["knee"])
+    turns[f"foot_{suffix}"] = rotation_about("y", -limb["ankle"])
     return turns
 
 

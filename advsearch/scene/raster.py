@@ -65,8 +65,8 @@ def find_candidate_pixels(
 ) -> tuple[IntArray, IntArray, IntArray]:
     """List the pixels whose centers lie in triangles, also flat ones, or nearly.
 
-    They may miss a triangle by `tolerance` pixels along their row or column. Other arguments
-    as for `rasterize_triangles`.
+    They may miss a triangle by `tolerance` pixels along their row or column. Other
+    arguments as for `rasterize_triangles`.
 
     Returns:
         Triangle, row and column (N,).
@@ -82,8 +82,8 @@ def find_candidate_pixels(
 def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray:
     """Return the texels (h, w) that bilinear look-ups in triangles read.
 
-    Look-ups repeat at the border. The triangles (F, 3, 2) are as for `rasterize_triangles`, at
-    most half a texel outside of the texture.
+    Look-ups repeat at the border. The triangles (F, 3, 2) are as for
+    `rasterize_triangles`, at most half a texel outside of the texture.
     """
     # A look-up between two texels is in the cell of the first; -1 is the last one
     # again.

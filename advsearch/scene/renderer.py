@@ -290,7 +290,9 @@ class Renderer:
     def _trace_halves(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
     ) -> tuple[list[Tensor], Tensor]:
-        """Trace two renders with independent noise; return them and the denoised mean."""
+        """Trace two renders with independent noise; return them and the denoised
+        mean.
+        """
         hide = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
         undenoised = self.copy_with(denoiser="none")
@@ -306,7 +308,9 @@ class Renderer:
         return halves, torch.cat([clean, mean[..., 3:]], dim=-1)
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the inputs of Mitsuba's scene at a configuration (d,), without a graph."""
+        """Return the inputs of Mitsuba's scene at a configuration (d,), without a
+        graph.
+        """
         inputs = self.scene.assembly(self.space.inputs(u))
         return {
             name: value.detach() for name, value in _select_scene_inputs(inputs).items()
@@ -503,17 +507,24 @@ class Renderer:
         self.renders = renders_before + 1
         if not is_denoised:
             return exposed
-        with torch.no_grad():
-            noisy = exposed[..., :3].contiguous()
-            clean = denoise(
-                noisy,
-                guides[..., :3].contiguous(),
-                guides[..., 3:].contiguous(),
-                quick=self.formation.quick,
-            )
-            no_coverage = torch.zeros_like(exposed[..., 3:])
-            change = torch.cat([clean - noisy, no_coverage], dim=-1)
-        return exposed + change  # its derivative is that without a denoiser
+        # its derivative is that without a denoiser
+        return exposed + self._compute_denoising_change(exposed, guides)
+
+    @torch.no_grad()
+    def _compute_denoising_change(self, exposed: Tensor, guides: Tensor) -> Tensor:
+        """Return by how much a denoiser changes radiance (H, W, 3 or 4).
+
+        `guides` are albedo and normals (H, W, 6).
+        """
+        noisy = exposed[..., :3].contiguous()
+        clean = denoise(
+            noisy,
+            guides[..., :3].contiguous(),
+            guides[..., 3:].contiguous(),
+            quick=self.formation.quick,
+        )
+        no_coverage = torch.zeros_like(exposed[..., 3:])
+        return torch.cat([clean - noisy, no_coverage], dim=-1)
 
     def finish_image(
         self,
@@ -613,7 +624,9 @@ class Renderer:
     def _compute_steps(
         self, groups: tuple[Group, ...], motion: Motion | None
     ) -> Tensor:
-        """Return half-widths (d,) of differences over which outlines move by a pixel."""
+        """Return half-widths (d,) of differences over which outlines move by a
+        pixel.
+        """
         speeds = torch.zeros(len(self.start))
         coordinates: list[int] = []
         for group in groups:
@@ -774,8 +787,8 @@ class _Radiance(torch.autograd.Function):
             renderer.gradients += 1
             for name, gradient in gradients.items():
                 by_input[name] = renderer.replace_non_finite(gradient)
-        no_gradients = (None,) * 6  # of the arguments before the tensors
-        return (*no_gradients, *(by_input.get(name) for name in ctx.names))
+        # six arguments before the tensors have no gradients
+        return (*(None,) * 6, *map(by_input.get, ctx.names))
 
 
 def _reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:

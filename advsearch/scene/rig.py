@@ -142,7 +142,9 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
 
 
 def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
-    """Raise FileFormatError unless cameras are few, unique, and the first is in place."""
+    """Raise FileFormatError unless cameras are few, unique, and the first is in
+    place.
+    """
     if not 2 <= len(mounts) <= MAX_CAMERAS:
         raise FileFormatError(
             f"{spec}: expected 2 to {MAX_CAMERAS} cameras, got {len(mounts)}"
@@ -275,8 +277,15 @@ def _read_transforms(path: str, frame_names: str) -> tuple[Mount, ...]:
         pose = matrix @ FROM_OPENGL
         pose[:3, 3] /= scale
         poses.append(pose)
+    return _make_mounts(path, names, poses, _read_frame_models(path, names, selected))
+
+
+def _read_frame_models(
+    path: str, names: Sequence[str], frames: Sequence[Mapping[str, Any]]
+) -> list[CameraModel]:
+    """Return the camera models of frames of a transforms.json, which have names."""
     lenses = [
-        {key: frame[key] for key in frame if key in LENS_KEYS} for frame in selected
+        {key: frame[key] for key in frame if key in LENS_KEYS} for frame in frames
     ]
     first_model = read_camera(f"{path}#{names[0]}")
     models = []
@@ -284,7 +293,7 @@ def _read_transforms(path: str, frame_names: str) -> tuple[Mount, ...]:
         # Frames with the same lens share its model.
         is_same = lens == lenses[0]
         models.append(first_model if is_same else read_camera(f"{path}#{name}"))
-    return _make_mounts(path, names, poses, models)
+    return models
 
 
 def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:

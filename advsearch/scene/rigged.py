@@ -52,7 +52,9 @@ MAX_ARC_COSINE = 1.0 - 1e-9
 
 
 def find_rig_parameter(name: str) -> Parameter | None:
-    """Return the parameter of a name `JOINT.x` (or y, z) or `TARGET.weight`, or None."""
+    """Return the parameter of a name `JOINT.x` (or y, z) or `TARGET.weight`, or
+    None.
+    """
     owner, dot, component = name.rpartition(".")
     if not (owner and dot and component in (*AXES, WEIGHT)):
         return None
@@ -68,6 +70,22 @@ def find_rig_parameter(name: str) -> Parameter | None:
         0.0,
         f"Turn of the joint {owner} about {component}.",
     )
+
+
+def _compose_matrices(translation: Tensor, rotation: Tensor, scale: Tensor) -> Tensor:
+    """Return matrices (N, 4, 4) that scale, rotate and then translate.
+
+    Args:
+        translation: (N, 3).
+        rotation: (N, 4) quaternions.
+        scale: (N, 3).
+    """
+    scaled_turns = quaternions_to_matrices(rotation) * scale[:, None]
+    last_row = torch.tensor(
+        [0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=scaled_turns.device
+    ).expand(len(scaled_turns), 1, 4)
+    upper_rows = torch.cat([scaled_turns, translation[:, :, None]], dim=2)
+    return torch.cat([upper_rows, last_row], dim=1)
 
 
 class SkeletonRig:
@@ -310,17 +328,7 @@ class SkeletonRig:
                 nodes = torch.tensor([track.node for track in tracks], device=device)
                 values = torch.stack([sample_track(track, seconds) for track in tracks])
                 properties[path] = properties[path].index_copy(0, nodes, values)
-        scaled_turns = (
-            quaternions_to_matrices(properties["rotation"])
-            * properties["scale"][:, None]
-        )
-        last_row = torch.tensor(
-            [0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=device
-        ).expand(len(scaled_turns), 1, 4)
-        upper_rows = torch.cat(
-            [scaled_turns, properties["translation"][:, :, None]], dim=2
-        )
-        composed = torch.cat([upper_rows, last_row], dim=1)
+        composed = _compose_matrices(**properties)
         is_fixed = torch.from_numpy(skeleton.has_matrix).to(device)
         local_matrices = torch.where(
             is_fixed[:, None, None], self._local_matrices.to(device), composed

@@ -111,6 +111,21 @@ def _generate_atlas(soup: Soup, groups: Sequence[IntArray]) -> xatlas.Atlas:
     return atlas
 
 
+def _are_straight(normals: Float64Array, plane: IntArray) -> bool:
+    """Return whether all faces have about the mean normal of their plane.
+
+    Args:
+        normals: (F, 3).
+        plane: (F,) index of the plane of each face.
+    """
+    plane_sums: Float64Array = np.stack(
+        [np.bincount(plane, normals[:, axis]) for axis in range(3)], axis=1
+    )
+    plane_normals = normalize_vectors(plane_sums)[plane]
+    is_straight = (normals * plane_normals).sum(axis=1) > _MIN_PLANE_COSINE
+    return bool(is_straight.all())
+
+
 def _find_patches(soup: Soup) -> IntArray:
     """Cut a mesh that xatlas cannot unwrap well in one piece.
 
@@ -130,12 +145,7 @@ def _find_patches(soup: Soup) -> IntArray:
     neighbour = right // 3
     is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
     plane = find_components(count, face[is_flush], neighbour[is_flush])
-    plane_sums: Float64Array = np.stack(
-        [np.bincount(plane, normals[:, axis]) for axis in range(3)], axis=1
-    )
-    plane_normals = normalize_vectors(plane_sums)[plane]
-    is_straight = (normals * plane_normals).sum(axis=1) > _MIN_PLANE_COSINE
-    if is_straight.all() and count <= _FACES_PER_ATLAS:
+    if _are_straight(normals, plane) and count <= _FACES_PER_ATLAS:
         return np.zeros(count, dtype=np.int64)
 
     smoothed = _smooth_normals(normals, face, neighbour)
@@ -297,7 +307,9 @@ def _unwrap_mesh(mesh: Mesh) -> Float64Array:
 
 
 def _rasterise_map(mesh: Mesh, uvs: Float64Array) -> Charts:
-    """Rasterise texture coordinates (F, 3, 2) of a mesh's faces into the map's cells."""
+    """Rasterise texture coordinates (F, 3, 2) of a mesh's faces into the map's
+    cells.
+    """
     vertex = mesh.faces.reshape(-1)
     faces = np.arange(len(vertex), dtype=np.uint32).reshape(-1, 3)
     flat_uvs = uvs.reshape(-1, 2).astype(np.float32)

@@ -214,7 +214,8 @@ def add_things(
         if asset.metres is None:
             example = f"{object_spec}@{thing.x:g},{thing.y:g},size=METRES"
             raise InputError(
-                f"things: the size of {object_spec} in metres is not known; say it: {example}"
+                f"things: the size of {object_spec} in metres is not known; say it: "
+                f"{example}"
             )
         if name in {part.name for part in scene.parts}:
             raise InputError(
@@ -342,7 +343,9 @@ def add_solid_remarks(scene: SceneDescription) -> SceneDescription:
 def list_camera_remarks(
     scene: SceneDescription, eyes: Sequence[Float64Array]
 ) -> tuple[str, ...]:
-    """Return a remark where cameras, at positions (3,) in metres, are inside a solid."""
+    """Return a remark where cameras, at positions (3,) in metres, are inside a
+    solid.
+    """
     inside = list[str]()
     for eye in eyes:
         x, y, z = eye / scene.metres

@@ -112,7 +112,9 @@ def setting(
     power: Power = none,
     **constraints: Any,
 ) -> Any:
-    """Create a pydantic field from a `Setting`, with constraints of `pydantic.Field`."""
+    """Create a pydantic field from a `Setting`, with constraints of
+    `pydantic.Field`.
+    """
     declared = Setting(
         default,
         group,
@@ -139,7 +141,9 @@ DERIVED_FIELDS = ("field", "name", "required", "is_switch", "is_mapping")
 
 
 def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
-    """Return a setting as another command declares it, with changed arguments of `setting`."""
+    """Return a setting as another command declares it, with changed arguments of
+    `setting`.
+    """
     extra: Any = config.model_fields[field].json_schema_extra
     declared = {
         name: value
@@ -253,8 +257,8 @@ class SettingsError(InputError):
 
 
 class PythonOnly(NamedTuple):
-    """A part of a run that exists only in one Python session: no file and no command can name
-    it.
+    """A part of a run that exists only in one Python session: no file and no command
+    can name it.
 
     Attributes:
         role: of the part in the run: "model", "scene", "objective", "policy", "metric",
@@ -271,10 +275,11 @@ class PythonOnly(NamedTuple):
 
 
 class Config(BaseModel):
-    """The settings of a command, checked as a whole. Frozen; unknown names are rejected.
+    """The settings of a command, checked as a whole. Frozen; unknown names are
+    rejected.
 
-    Each command's configuration is a subclass. Raises InputError if a value is out of range
-    or an unknown setting is named; the message lists every problem.
+    Each command's configuration is a subclass. Raises InputError if a value is out of
+    range or an unknown setting is named; the message lists every problem.
     """
 
     command: ClassVar[str]
@@ -323,7 +328,9 @@ class Config(BaseModel):
 
     @model_validator(mode="after")
     def _without_clashes(self) -> Self:
-        """Check settings that the command does not have, and those that contradict others."""
+        """Check settings that the command does not have, and those that contradict
+        others.
+        """
         for name in self.without:
             field = type(self).model_fields[name]
             if getattr(self, name) != field.get_default(call_default_factory=True):
@@ -352,8 +359,8 @@ class Config(BaseModel):
 
         Args:
             path: of the file.
-            overrides: settings by name that a person has requested. A dotted name reaches
-                inside: ``set.camera.azimuth``, ``controls.pose.yaw``.
+            overrides: settings by name that a person has requested. A dotted name
+                reaches inside: ``set.camera.azimuth``, ``controls.pose.yaw``.
 
         Raises:
             FileFormatError, InputError: as for the class; the message names the file.
@@ -392,13 +399,15 @@ class Config(BaseModel):
 
     @property
     def left_out(self) -> tuple[LeftOut, ...]:
-        """The settings of the file with power over more than the run, which count as not set."""
+        """The settings of the file with power over more than the run, which count as
+        not set.
+        """
         return self._left_out
 
     @property
     def session_settings(self) -> dict[str, Any]:
-        """The settings of this session that may have such power and decide no number, which parts
-        of a run get too.
+        """The settings of this session that may have such power and decide no number,
+        which parts of a run get too.
         """
         return {
             setting.name: getattr(self, setting.field)
@@ -409,8 +418,8 @@ class Config(BaseModel):
         }
 
     def check_powers(self, where: str) -> None:
-        """Raise InputError if a file, named `where`, has settings with power over more than
-        the run.
+        """Raise InputError if a file, named `where`, has settings with power over more
+        than the run.
         """
         for name, _, _, effect, _ in self.powers:
             raise InputError(
@@ -420,7 +429,8 @@ class Config(BaseModel):
 
     @classmethod
     def get_shared_settings(cls, other: Config) -> dict[str, object]:
-        """Return the settings of another configuration that this command shares with it.
+        """Return the settings of another configuration that this command shares with
+        it.
 
         They are those of the most specific common class, except for where the run is
         stored and who shares its work.
@@ -439,8 +449,8 @@ class Config(BaseModel):
 
     @classmethod
     def from_config(cls, other: Config, **changes: object) -> Self:
-        """Create a configuration of this command from that of another: the settings that are
-        `shared`, and the changes.
+        """Create a configuration of this command from that of another: the settings
+        that are `shared`, and the changes.
         """
         return cls(
             **{**cls.get_shared_settings(other), **changes}
@@ -500,7 +510,9 @@ class Config(BaseModel):
 
     @property
     def run_location(self) -> tuple[str | None, bool]:
-        """Where the run is stored, None if that is not set, and whether a run there is replaced."""
+        """Where the run is stored, None if that is not set, and whether a run there is
+        replaced.
+        """
         return getattr(self, "run", None), getattr(self, "overwrite", False)
 
     @property
@@ -509,8 +521,8 @@ class Config(BaseModel):
         return (self.command,)
 
     def make_repeatable(self) -> Self:
-        """Return what `run.yaml` stores: files by absolute path, and no place of the run,
-        because a repetition gets its own.
+        """Return what `run.yaml` stores: files by absolute path, and no place of the
+        run, because a repetition gets its own.
         """
         absolute = {}
         for name in FILES:
@@ -522,7 +534,9 @@ class Config(BaseModel):
         return self.model_copy(update={**absolute, **RUN_LOCATION})
 
     def command_line(self, run: str | Path | None) -> str | None:
-        """Return the shell command that repeats the run in a directory; None if there is none."""
+        """Return the shell command that repeats the run in a directory; None if there
+        is none.
+        """
         if run is None or self._python_only_parts:
             return None
         return shlex.join(["advsearch", "run", str(Path(run) / written.CONFIG)])
@@ -533,8 +547,8 @@ class Config(BaseModel):
         return [part.text for part in self._python_only_parts]
 
     def get_deciding_settings(self) -> JsonObject:
-        """Return the settings that decide a run's numbers, as JSON values: all that are not
-        `free`.
+        """Return the settings that decide a run's numbers, as JSON values: all that are
+        not `free`.
 
         Files have their names only, because they may have been moved.
         """

@@ -61,7 +61,9 @@ def to_text(value: Any, *, several: bool = False) -> Any:
 
 
 def text_validator(*names: str, several: Sequence[str] = ()) -> Any:
-    """Return a validator that reads settings, and those with `several` names, by `to_text`."""
+    """Return a validator that reads settings, and those with `several` names, by
+    `to_text`.
+    """
 
     def read(value: Any, info: ValidationInfo) -> Any:
         return to_text(value, several=info.field_name in several)
@@ -80,8 +82,8 @@ def unique_names_validator(*names: str) -> Any:
 
 
 def are_all_finite(value: Any) -> bool:
-    """Whether all numbers in a value, which `is_shallow`, are finite, and integers at most
-    2**63 - 1.
+    """Whether all numbers in a value, which `is_shallow`, are finite, and integers at
+    most 2**63 - 1.
     """
     if isinstance(value, Mapping):
         return all(are_all_finite(inner) for inner in value.values())
@@ -139,7 +141,9 @@ FOR_ALL = "*"  # the name of the choice for everything without a choice of its o
 
 
 def parse_choices(texts: Iterable[str], setting: str) -> dict[str, object]:
-    """Parse texts as `parse_assignments`; a text without a name is the choice `FOR_ALL`."""
+    """Parse texts as `parse_assignments`; a text without a name is the choice
+    `FOR_ALL`.
+    """
     pairs = [
         parse_assignment(text, setting) if "=" in text else (FOR_ALL, text)
         for text in texts
@@ -271,7 +275,8 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
         bases = [bases]
     if not isinstance(bases, list) or not all(isinstance(base, str) for base in bases):
         raise FileFormatError(
-            f"{path}: base: expected a file or a list of files, got {format_value(bases)}"
+            f"{path}: base: expected a file or a list of files, got "
+            f"{format_value(bases)}"
         )
     if len(above) >= MAX_BASES or len(bases) > MAX_BASES:
         raise FileFormatError(
@@ -293,7 +298,9 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
 def merge_mappings(
     base: Mapping[str, object], override: Mapping[str, object]
 ) -> dict[str, object]:
-    """Return `base` overridden by `override`: mappings are merged, other values replaced."""
+    """Return `base` overridden by `override`: mappings are merged, other values
+    replaced.
+    """
     result = dict(base)
     for name, value in override.items():
         previous = result.get(name)

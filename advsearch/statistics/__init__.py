@@ -1,4 +1,5 @@
-"""Statistics of counts and rates: intervals, sequential rules, paired and clustered tests.
+"""Statistics of counts and rates: intervals, sequential rules, paired and clustered
+tests.
 
 Pure functions of numbers and arrays, each with its source. Nothing here knows a run, a
 trial or a drive. A module is imported when it is first used, since scipy takes long.

@@ -92,7 +92,9 @@ def rate_interval(
 
 
 def _betting_interval(samples: FloatArray, confidence: float) -> tuple[float, float]:
-    """Return the interval of the mean of independent samples (n,) in [0, 1], by bets."""
+    """Return the interval of the mean of independent samples (n,) in [0, 1], by
+    bets.
+    """
     values, counts = np.unique(samples, return_counts=True)
     threshold = np.log(2.0 / (1.0 - confidence))
 
@@ -170,7 +172,8 @@ def compare_paired(
 def _compare_independent_rows(
     first: npt.NDArray[np.bool_], second: npt.NDArray[np.bool_]
 ) -> tuple[float, tuple[float, float], float]:
-    """Compare two outcomes (n,) of independent rows by the tests of Newcombe and McNemar.
+    """Compare two outcomes (n,) of independent rows by the tests of Newcombe and
+    McNemar.
 
     Returns:
         As `compare_paired`.
@@ -200,13 +203,14 @@ def one_sided_p_value(
 
     The hypothesis is that as large a part of the predictions is right outside. Where
     each unit has a single prediction, this is Fisher's exact test. Where all units have
-    equally many and lie inside or outside, units are permuted. Elsewhere, where the rule
-    cuts through units or some have more predictions than others, it is a bound by bets
-    (`_betting_p_value`). All units weigh the same (`mean_rate`).
+    equally many and lie inside or outside, units are permuted. Elsewhere, where the
+    rule cuts through units or some have more predictions than others, it is a bound by
+    bets (`_betting_p_value`). All units weigh the same (`mean_rate`).
 
     Args:
         n_right_inside, of: (n,) of each unit, right predictions and predictions inside.
-        n_right_outside, rest: (n,) of each unit, right predictions and predictions outside.
+        n_right_outside, rest: (n,) of each unit, right predictions and predictions
+            outside.
         copies: how many copies there are of each of these units.
     """
     right_inside = np.asarray(n_right_inside, dtype=np.float64)

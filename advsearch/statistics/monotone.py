@@ -21,8 +21,8 @@ class Dip:
         counts: pictures that are right there, and how many there are.
         until: the farthest of the distances beyond it that are compared with it.
         counts_beyond: pictures that are right at these, and how many there are.
-        p_value: how likely so large a difference is where the share falls with the distance;
-            of all differences that were looked at together.
+        p_value: how likely so large a difference is where the share falls with the
+            distance; of all differences that were looked at together.
     """
 
     distance: float

@@ -61,11 +61,11 @@ def _phi_coefficient(both: int, first: int, second: int, neither: int) -> float:
 def mcnemar(first: int, second: int) -> float:
     """Return the p-value, in (0, 1], of McNemar's exact two-sided test.
 
-    Of pairs in which one outcome alone happens, it is the probability that chance splits
-    them so unevenly (McNemar 1947, "Note on the sampling error of the difference between
-    correlated proportions or percentages"): twice the smaller tail of the binomial
-    distribution, as these pairs are throws of a fair coin where neither outcome happens
-    more often.
+    Of pairs in which one outcome alone happens, it is the probability that chance
+    splits them so unevenly (McNemar 1947, "Note on the sampling error of the difference
+    between correlated proportions or percentages"): twice the smaller tail of the
+    binomial distribution, as these pairs are throws of a fair coin where neither
+    outcome happens more often.
     """
     if min(first, second) < 0:
         raise InputError(f"pairs: expected numbers from 0, got {first} and {second}")

@@ -1,4 +1,6 @@
-"""Tasks: what a model predicts, and how its output is judged against the ground truth."""
+"""Tasks: what a model predicts, and how its output is judged against the ground
+truth.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,9 @@ MAX_LISTED_NUMBERS = 4  # maximum size of an output whose label lists its number
 
 @dataclass(frozen=True, kw_only=True)
 class FunctionTask(Task):
-    """A task defined by a function, see `make_function_task`; its truth is the scene's facts."""
+    """A task defined by a function, see `make_function_task`; its truth is the scene's
+    facts.
+    """
 
     name = "own"
     varies = True
@@ -78,7 +82,9 @@ class FunctionTask(Task):
         return facts
 
     def loss(self, output: Any, truth: Facts) -> Tensor:
-        """Return the function's values, (N,). Raises InputError if they are not that."""
+        """Return the function's values, (N,). Raises InputError if they are not
+        that.
+        """
         losses = self.function(copied(output), truth)
         count = len(output)
         is_tensor = isinstance(losses, Tensor)
@@ -122,9 +128,9 @@ def make_function_task(function: Callable[[Any, Facts], Tensor]) -> FunctionTask
     """Create a task from a function, whose name becomes the task's.
 
     Args:
-        function: `judge(output, truth)`, with the outputs of the model for N images
-            (N, ...), and `Facts`: the ground truth of the scene in this configuration,
-            such as `truth.number("pose.yaw")`, `truth.mask` or `truth.label`. It returns
+        function: `judge(output, truth)`, with the outputs of the model for N images (N,
+            ...), and `Facts`: the ground truth of the scene in this configuration, such
+            as `truth.number("pose.yaw")`, `truth.mask` or `truth.label`. It returns
             (N,), or a number for one image: over 0 exactly if the output is wrong,
             differentiable.
 
@@ -165,8 +171,9 @@ def make_task(task: AnyTask) -> Task:
 
     Args:
         task: a name; a mapping with a `name` and options, which are the fields of the
-            task's dataclass; a task, which is returned; or a function (`make_function_task`). For
-            a joint task, "detection+depth", the options of each stand under its name.
+            task's dataclass; a task, which is returned; or a function
+            (`make_function_task`). For a joint task, "detection+depth", the options of
+            each stand under its name.
 
     Raises:
         UnknownNameError: there is no such task, or it has no such option.

@@ -43,20 +43,22 @@ class AnswerWithLogits(TypedDict):
 
 @dataclass(frozen=True, kw_only=True)
 class FreeAnswer(Task):
-    """Judge whether an answer contains one of the right words, as a full word in any case.
+    """Judge whether an answer contains one of the right words, as a full word in any
+    case.
 
     The truth is those words. Whether an answer is right depends on its text alone; how
-    nearly, on the logits. Let p be the sigmoid of the lead that tokens which begin such a
-    word have over all others, at the step where it is largest: the loss is log(1 - p) for a
-    right answer and -log(p) for a wrong one.
+    nearly, on the logits. Let p be the sigmoid of the lead that tokens which begin such
+    a word have over all others, at the step where it is largest: the loss is log(1 - p)
+    for a right answer and -log(p) for a wrong one.
 
-    For a model without logits (`AnswersWithoutLogits`) the loss is 1 - 2 s, where s is the fraction of
-    right answers among those about one image: it is right if at least half of them are.
+    For a model without logits (`AnswersWithoutLogits`) the loss is 1 - 2 s, where s is
+    the fraction of right answers among those about one image: it is right if at least
+    half of them are.
 
     Args:
         tokens: maximum number of tokens of an answer.
-        times: number of requests per image, for a model behind an address, whose answers
-            may differ.
+        times: number of requests per image, for a model behind an address, whose
+            answers may differ.
 
     Raises:
         InputError: `tokens` or `times` is less than one, or more than `MAX_COUNT`.
@@ -81,8 +83,8 @@ class FreeAnswer(Task):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> FreeAnswer:
-        """See `Task.on`: the target is a word, or several separated by commas, of which the
-        answer has to contain one.
+        """See `Task.on`: the target is a word, or several separated by commas, of which
+        the answer has to contain one.
         """
         if model.read is None:
             raise InputError(
@@ -174,7 +176,8 @@ class FreeAnswer(Task):
         truth: Words,
         margins: Sequence[float],
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.said`: of several texts, the most frequent among those that decided.
+        """See `Task.said`: of several texts, the most frequent among those that
+        decided.
 
         The payload has all of them.
         """
@@ -244,8 +247,8 @@ def _parse_words(setting: str, text: str) -> Words:
 
 
 def has_word(text: str, words: Words) -> bool:
-    """Whether a text contains one of the words or terms in any case; "mug" is no word of
-    "smug".
+    """Whether a text contains one of the words or terms in any case; "mug" is no word
+    of "smug".
     """
     text = " ".join(text.split()).casefold()
     return any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text) for word in words)

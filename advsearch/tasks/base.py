@@ -65,8 +65,8 @@ class Judgement:
         payload: what else is stored in the run's rows, as JSON values (boxes, masks);
             None if there is nothing.
         objective: what the search maximises for this image; None without a search.
-        metrics: values of the run's metrics for this image by name, None for one that is
-            not a number; None if there are no metrics.
+        metrics: values of the run's metrics for this image by name, None for one that
+            is not a number; None if there are no metrics.
     """
 
     score: float
@@ -85,7 +85,9 @@ class Judgement:
         prediction: Prediction,
         payload: JsonValue = None,
     ) -> Judgement:
-        """Create the judgement of an output; `NOT_A_NUMBER` if its margin is not finite."""
+        """Create the judgement of an output; `NOT_A_NUMBER` if its margin is not
+        finite.
+        """
         if not math.isfinite(margin):
             not_a_number = Prediction(NOT_A_NUMBER)
             return cls(math.nan, math.nan, right=False, prediction=not_a_number)
@@ -150,21 +152,23 @@ class Sight:
 
 @dataclass(frozen=True)
 class Facts:
-    """The ground truth of a scene in one configuration, from which a task takes its own.
+    """The ground truth of a scene in one configuration, from which a task takes its
+    own.
 
     Attributes:
         object: its name, for messages.
         label: the right label by the setting `label`; None without it.
         object_label: the label that the object's file states; None if it states none.
-        describe_values: returns the values of the configuration by parameter ("pose.yaw"), in
-            the units that rows have.
-        compute_sight: computes what is visible in the image, see `mask` and `depth`; None if the
-            facts belong to no configuration.
+        describe_values: returns the values of the configuration by parameter
+            ("pose.yaw"), in the units that rows have.
+        compute_sight: computes what is visible in the image, see `mask` and `depth`;
+            None if the facts belong to no configuration.
         each: the facts of each evaluated thing by name, the object first; empty if only
             the object is evaluated.
         others: the facts of every other thing in the scene, the object included if
             another thing is evaluated.
-        views: the facts in the image of each camera of a rig; empty for a single camera.
+        views: the facts in the image of each camera of a rig; empty for a single
+            camera.
     """
 
     object: str
@@ -193,7 +197,8 @@ class Facts:
 
     @property
     def mask(self) -> Tensor:
-        """The pixels in which the object is the first thing that the camera sees, (H, W) bool.
+        """The pixels in which the object is the first thing that the camera sees, (H,
+        W) bool.
 
         A pixel is probed at its center. Where something occludes the object the mask is
         false; an image corruption leaves it as it is. Raises InputError as `sight`.
@@ -204,25 +209,26 @@ class Facts:
     def depth(self) -> Tensor:
         """The distance from the camera along the ray of each pixel, (H, W) float32.
 
-        In metres; in object sizes if the size of the object is unknown. Infinite where there
-        is only the environment. Probed as the mask is. Raises InputError as `sight`.
+        In metres; in object sizes if the size of the object is unknown. Infinite where
+        there is only the environment. Probed as the mask is. Raises InputError as
+        `sight`.
         """
         return self.sight.depth.clone()
 
     @property
     def z_depth(self) -> Tensor:
-        """The component of `depth` along the camera's axis, (H, W) float32: what a depth camera
-        measures. Raises InputError as `sight`.
+        """The component of `depth` along the camera's axis, (H, W) float32: what a
+        depth camera measures. Raises InputError as `sight`.
         """
         return self.sight.z_depth.clone()
 
     @cached_property
     def box(self) -> tuple[int, int, int, int] | None:
-        """The smallest box around the visible part of the object: x0, y0, x1, y1 in pixels
-        from the top left.
+        """The smallest box around the visible part of the object: x0, y0, x1, y1 in
+        pixels from the top left.
 
-        Its pixels have x0 <= x < x1 and y0 <= y < y1. None if the object is out of view.
-        Raises InputError as `sight`.
+        Its pixels have x0 <= x < x1 and y0 <= y < y1. None if the object is out of
+        view. Raises InputError as `sight`.
         """
         columns = self.mask.any(dim=0).nonzero().flatten().tolist()
         rows = self.mask.any(dim=1).nonzero().flatten().tolist()
@@ -341,15 +347,17 @@ class Task(ABC):
     def loss(self, output: Output, truth: Truth) -> Tensor:
         """Compute how wrong each of N outputs is, (N,); differentiable.
 
-        It is over 0 exactly if the output is not right. It is maximised if no other objective
-        is chosen, so it should rise towards a wrong prediction from afar.
+        It is over 0 exactly if the output is not right. It is maximised if no other
+        objective is chosen, so it should rise towards a wrong prediction from afar.
         """
 
     @abstractmethod
     def predictions(
         self, output: Output, count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        """Return at most `count` predictions for each of N images, the likeliest first."""
+        """Return at most `count` predictions for each of N images, the likeliest
+        first.
+        """
 
     # ---- a task may define ----
 
@@ -366,15 +374,15 @@ class Task(ABC):
         raise ValueError(f"expected a tensor with {count} rows, one for each picture")
 
     def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a network that takes images alone; it is the same one unless the task passes
-        further inputs to it.
+        """Return a network that takes images alone; it is the same one unless the task
+        passes further inputs to it.
         """
         return network
 
     @property
     def calibrates(self) -> bool:
-        """Whether the task needs the output for a clean image of the scene before it judges
-        (`after_calibration`).
+        """Whether the task needs the output for a clean image of the scene before it
+        judges (`after_calibration`).
         """
         return False
 
@@ -391,7 +399,9 @@ class Task(ABC):
 
     @property
     def ambiguities(self) -> str:
-        """What the user must state for outputs to be readable, as a message; empty if nothing."""
+        """What the user must state for outputs to be readable, as a message; empty if
+        nothing.
+        """
         return ""
 
     @property
@@ -401,7 +411,9 @@ class Task(ABC):
 
     @property
     def reader(self) -> Callable[[Any, int], Output] | None:
-        """The function that reads the outputs of its models; None if these are logits."""
+        """The function that reads the outputs of its models; None if these are
+        logits.
+        """
         return None if self.reads_logits else self.read
 
     def on(
@@ -426,7 +438,9 @@ class Task(ABC):
         return replace(self, minimise=minimise)
 
     def with_objective(self: TaskType, objective: str) -> TaskType:
-        """Return the task with one of its objectives, which may define what counts as success."""
+        """Return the task with one of its objectives, which may define what counts as
+        success.
+        """
         return self
 
     def check(self, facts: Facts) -> None:
@@ -449,18 +463,20 @@ class Task(ABC):
         return -loss if self.minimise else loss
 
     def as_logits(self, output: Output, truth: Truth) -> Output:
-        """Return the output as objectives of logits take it, without classes that are no
-        predictions.
+        """Return the output as objectives of logits take it, without classes that are
+        no predictions.
         """
         return output
 
     def payloads(self, output: Output) -> Sequence[Any]:
-        """Return what is stored of each of N outputs beyond its label, as JSON values."""
+        """Return what is stored of each of N outputs beyond its label, as JSON
+        values.
+        """
         return [None] * len(output)
 
     def marks(self, output: Output, truth: Truth) -> list[list[Mark]]:
-        """Return what to draw on each of N images to show the prediction; empty if its label
-        says it all.
+        """Return what to draw on each of N images to show the prediction; empty if its
+        label says it all.
         """
         return [[] for _ in range(len(output))]
 

@@ -1,4 +1,6 @@
-"""Compute with boxes (x0, y0, x1, y1 from the top left): overlap, suppression, formats."""
+"""Compute with boxes (x0, y0, x1, y1 from the top left): overlap, suppression,
+formats.
+"""
 
 from __future__ import annotations
 
@@ -89,7 +91,8 @@ def suppress_class(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
         iou: intersection over union from which a better box suppresses another.
 
     Returns:
-        Which boxes survive, (D,) bool; none of those beyond the best `MAX_SUPPRESSED` does.
+        Which boxes survive, (D,) bool; none of those beyond the best `MAX_SUPPRESSED`
+        does.
     """
     order = scores.argsort(descending=True)[:MAX_SUPPRESSED]
     sorted_boxes = boxes[order]
@@ -228,14 +231,16 @@ def max_or_zero(values: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def are_invalid(boxes: Tensor) -> Tensor:
-    """Whether boxes (D, 4) of any format are invalid, (D,) bool: four equal numbers, or one
-    that is not finite.
+    """Whether boxes (D, 4) of any format are invalid, (D,) bool: four equal numbers, or
+    one that is not finite.
     """
     return (boxes == boxes[:, :1]).all(dim=1) | ~boxes.isfinite().all(dim=1)
 
 
 def are_counted(detections: Detections) -> Tensor:
-    """Which rows count, (D,) bool: they have a valid box and a number over 0 with it."""
+    """Which rows count, (D,) bool: they have a valid box and a number over 0 with
+    it.
+    """
     has_number = (get_box_numbers(detections) > 0.0).any(dim=1)
     return ~are_invalid(detections["boxes"]) & has_number
 
@@ -270,7 +275,8 @@ MIN_PIXELS = 4.0
 fractions of the image, from the second on pixels.
 """
 
-# How far outside the image a box's center may lie, as a fraction of its width or height.
+# How far outside the image a box's center may lie, as a fraction of its width or
+# height.
 MAX_CENTER_OVERSHOOT = 0.25
 
 DOUBTFUL_FRACTION = 0.5
@@ -305,7 +311,9 @@ class BoxFormat:
         return to_corners(boxes, self.form) / boxes.new_tensor([width, height] * 2)
 
     def find_faults(self, boxes: Tensor) -> dict[str, Tensor]:
-        """Find which of boxes (D, 4) are implausible in this format, (D,) bool by fault."""
+        """Find which of boxes (D, 4) are implausible in this format, (D,) bool by
+        fault.
+        """
         fractions = self.to_fractions(boxes)
         height, width = self.input_size
         center = (fractions[:, :2] + fractions[:, 2:]) / 2.0
@@ -328,7 +336,9 @@ class BoxFormat:
         return float((~has_fault).all(dim=0).float().mean())
 
     def describe_fault(self, boxes: Tensor) -> str:
-        """Describe what is implausible about boxes (D, 4); empty if most are plausible."""
+        """Describe what is implausible about boxes (D, 4); empty if most are
+        plausible.
+        """
         if (
             not len(boxes)
             or self.compute_plausible_fraction(boxes) >= DOUBTFUL_FRACTION
@@ -342,7 +352,8 @@ class BoxFormat:
         return f"{100.0 * fraction_by_fault[worst]:.0f} % of them {worst}"
 
     def suggest_plausible_formats(self, boxes: Tensor) -> str:
-        """Suggest the formats in which boxes (D, 4) are plausible; empty if there is none.
+        """Suggest the formats in which boxes (D, 4) are plausible; empty if there is
+        none.
 
         Of several, those that differ least from this one.
         """
@@ -377,7 +388,8 @@ class BoxFormat:
     def suggest_better_format(
         self, boxes: Tensor, true_box: Tensor, min_iou: float
     ) -> str:
-        """Suggest the format in which a box fits the true box much better; empty if none.
+        """Suggest the format in which a box fits the true box much better; empty if
+        none.
 
         Args:
             boxes: (D, 4), with a right class.

@@ -1,4 +1,5 @@
-"""Judge classification, and define the base of tasks whose models know classes by index.
+"""Judge classification, and define the base of tasks whose models know classes by
+index.
 
 Names of classes, softmax, argmax and leads of logits are defined here.
 """
@@ -106,12 +107,12 @@ class ClassTask(Task):
         return None
 
     def find_right_classes(self, facts: Facts) -> Labels:
-        """Return the indices of the right classes: of the setting `label`, or else of the
-        object's own label.
+        """Return the indices of the right classes: of the setting `label`, or else of
+        the object's own label.
 
         Raises:
-            InputError: the model has no such class, the object has no label, or a target
-                is right.
+            InputError: the model has no such class, the object has no label, or a
+                target is right.
         """
         text = facts.object_label if facts.label is None else facts.label
         if text is None:
@@ -170,8 +171,8 @@ class ClassTask(Task):
 class Classification(ClassTask):
     """Judge whether the largest logit is that of a right class.
 
-    The truth is the indices of the right classes, of which there may be several ("coffee
-    mug" and "cup").
+    The truth is the indices of the right classes, of which there may be several
+    ("coffee mug" and "cup").
     """
 
     name = "classification"
@@ -203,8 +204,8 @@ class Classification(ClassTask):
     def predictions(
         self, output: Tensor, count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        """Return the likeliest classes of each image; with a count of 1, the one with the
-        lowest index of equally likely ones.
+        """Return the likeliest classes of each image; with a count of 1, the one with
+        the lowest index of equally likely ones.
         """
         return self._rank_classes(self.as_logits(output, ()), count)
 
@@ -266,7 +267,8 @@ class Classification(ClassTask):
 def compute_wrong_lead(logits: Tensor, right: Labels) -> Tensor:
     """Compute the largest wrong logit minus the largest right one, (N,).
 
-    It is over 0 exactly if the prediction is wrong. Raises InputError as `make_class_mask`.
+    It is over 0 exactly if the prediction is wrong. Raises InputError as
+    `make_class_mask`.
     """
     is_right = make_class_mask(logits, right)
     return compute_largest_logit(logits, ~is_right) - compute_largest_logit(
@@ -277,7 +279,8 @@ def compute_wrong_lead(logits: Tensor, right: Labels) -> Tensor:
 def compute_target_lead(logits: Tensor, targets: Labels) -> Tensor:
     """Compute the largest logit of the targets minus the largest other one, (N,).
 
-    It is over 0 exactly if a target is predicted. Raises InputError as `make_class_mask`.
+    It is over 0 exactly if a target is predicted. Raises InputError as
+    `make_class_mask`.
     """
     is_target = make_class_mask(logits, targets, "target")
     return compute_largest_logit(logits, is_target) - compute_largest_logit(

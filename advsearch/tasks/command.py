@@ -1,4 +1,6 @@
-"""Judge commands: how far a policy's action leaves an envelope around its clean action."""
+"""Judge commands: how far a policy's action leaves an envelope around its clean
+action.
+"""
 
 from __future__ import annotations
 
@@ -37,10 +39,10 @@ MAX_FORMATTED_ELEMENTS = 4  # how many elements of an action its text has
 class Command(Task):
     """Judge the action of a policy by the one in the clean scene.
 
-    It is open loop: one image, one action. The output is actions (N, A), in the units of
-    the policy. The truth is the clean action c (A,), from one image of the clean scene.
-    With the envelope e the loss is max |a - c| / e over the elements, minus 1. With a
-    target t, a success is max |a - t| / e of at most 1.
+    It is open loop: one image, one action. The output is actions (N, A), in the units
+    of the policy. The truth is the clean action c (A,), from one image of the clean
+    scene. With the envelope e the loss is max |a - c| / e over the elements, minus 1.
+    With a target t, a success is max |a - t| / e of at most 1.
 
     Args:
         state: inputs of the policy other than images: numbers, or lists of numbers, by
@@ -122,7 +124,8 @@ class Command(Task):
             actions = actions[:, None]
         if actions.ndim != 2 or not 1 <= actions.shape[1] <= MAX_NUMBERS:
             raise ValueError(
-                f"expected one action for each picture, (N, A), with A from 1 to {MAX_NUMBERS}"
+                "expected one action for each picture, (N, A), with A from 1 to "
+                f"{MAX_NUMBERS}"
             )
         for option in ("envelope", "names", "units"):
             size = len(getattr(self, option) or ())
@@ -137,12 +140,13 @@ class Command(Task):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Command:
-        """See `Task.on`: the target is an action, ``0.1,-0.3``, or some of its elements,
-        ``yaw rate=-0.3``.
+        """See `Task.on`: the target is an action, ``0.1,-0.3``, or some of its
+        elements, ``yaw rate=-0.3``.
 
         Raises:
-            InputError: there is no envelope, the model was loaded for another task or with
-                names of classes, the target is no action, or the clean action is sought.
+            InputError: there is no envelope, the model was loaded for another task or
+                with names of classes, the target is no action, or the clean action is
+                sought.
         """
         if model.read is None:
             raise InputError(
@@ -194,8 +198,8 @@ class Command(Task):
         """See `Task.after_calibration`: store the clean action.
 
         Raises:
-            InputError: the clean action is not finite, or the target has another size or
-                is too near to it.
+            InputError: the clean action is not finite, or the target has another size
+                or is too near to it.
         """
         if not self.calibrates:
             return self
@@ -210,7 +214,9 @@ class Command(Task):
         return replace(self, clean=clean_action)
 
     def _check_target(self, clean_action: Tensor) -> None:
-        """Check the target's size, and that its envelope is apart from the clean one."""
+        """Check the target's size, and that its envelope is apart from the clean
+        one.
+        """
         if len(self.target) != len(clean_action):
             raise InputError(
                 f"target: expected an action of {len(clean_action)} "
@@ -317,7 +323,9 @@ class Command(Task):
         return results
 
     def _outside_label(self, deviation: Tensor) -> str:
-        """Return the label of an action outside its envelope, with its deviation (A,)."""
+        """Return the label of an action outside its envelope, with its deviation
+        (A,).
+        """
         furthest = int(deviation.abs().argmax())
         direction = "above" if deviation[furthest] > 0.0 else "below"
         return f"action outside its envelope ({self._name(furthest)} {direction} it)"

@@ -98,8 +98,8 @@ class DepthTruth:
 
     @property
     def fit_mask(self) -> Tensor:
-        """The pixels on which scale and shift are fitted, (H, W) bool: those outside the object,
-        or all if those do not determine them.
+        """The pixels on which scale and shift are fitted, (H, W) bool: those outside
+        the object, or all if those do not determine them.
         """
         return self.outside_object if self.determines_scale else self.z.isfinite()
 
@@ -107,9 +107,9 @@ class DepthTruth:
     def background_disparity(self) -> Tensor:
         """The disparity of what is behind the object, (H, W); NaN if it is unknown.
 
-        It is interpolated linearly between the nearest pixels to the left and right of the
-        object in the same row, which is exact for a plane. What is infinitely far has a
-        disparity of 0.
+        It is interpolated linearly between the nearest pixels to the left and right of
+        the object in the same row, which is exact for a plane. What is infinitely far
+        has a disparity of 0.
         """
         height, width = self.mask.shape
         disparity = self.z.reciprocal()
@@ -131,10 +131,11 @@ class DepthTruth:
 
 @dataclass(frozen=True, kw_only=True)
 class Depth(Task):
-    """Judge whether a model predicts the object's distance within a factor of 1 + `tolerance`.
+    """Judge whether a model predicts the object's distance within a factor of 1 +
+    `tolerance`.
 
-    The factor is the geometric mean over the object's pixels. If nothing of the object is
-    visible, every prediction is right.
+    The factor is the geometric mean over the object's pixels. If nothing of the object
+    is visible, every prediction is right.
 
     Args:
         tolerance: 0.25 for a factor of 1.25, the first threshold of Eigen et al. 2014
@@ -208,8 +209,8 @@ class Depth(Task):
         """See `Task.on`.
 
         Raises:
-            InputError: the model was loaded for another task or with names of classes, or
-                there is a target.
+            InputError: the model was loaded for another task or with names of classes,
+                or there is a target.
         """
         if model.read is None:
             raise InputError(
@@ -238,7 +239,9 @@ class Depth(Task):
         return replace(self, resolved_kind=kind, missing=self._missing(kind, truth))
 
     def _missing(self, kind: str, truth: DepthTruth | None) -> str:
-        """Return what the user has to state before predictions can be judged, "" if nothing."""
+        """Return what the user has to state before predictions can be judged, "" if
+        nothing.
+        """
         if not kind:
             return (
                 f"kind: expected what its numbers are, one of {', '.join(KINDS)}, and "
@@ -276,7 +279,10 @@ class Depth(Task):
     def remarks(self) -> tuple[str, ...]:
         if not self.resolved_kind:
             return ()
-        text = f"The model's numbers are read as {self.resolved_kind}: {KINDS[self.resolved_kind]}"
+        text = (
+            f"The model's numbers are read as {self.resolved_kind}: "
+            f"{KINDS[self.resolved_kind]}"
+        )
         if self.resolved_kind != METRIC:
             return (
                 f"{text}, which are found by least squares on what is seen beside the "
@@ -301,7 +307,8 @@ class Depth(Task):
             raise InputError(
                 "task depth: a model's depth is the distance along the camera's axis, "
                 "and this lens sees things more "
-                f"than {math.degrees(math.acos(MIN_AXIS_COSINE)):.0f} degrees from its axis; "
+                f"than {math.degrees(math.acos(MIN_AXIS_COSINE)):.0f} degrees from its "
+                "axis; "
                 "take a lens that sees less"
             )
         return DepthTruth(facts.mask, facts.z_depth, facts.sight.metres)
@@ -324,12 +331,12 @@ class Depth(Task):
         )
 
     def score(self, output: Sequence[DepthMap], truth: DepthTruth) -> Tensor:
-        """Compute how near each of N outputs is to what is sought, (N,); over 0 if it is a
-        success.
+        """Compute how near each of N outputs is to what is sought, (N,); over 0 if it
+        is a success.
 
         "nearer" and "farther" take the signed mean over pixels. "gone" is the lesser of
-        the loss, and of how far the remaining fraction of the object's relief is below a
-        half; see `_relief`.
+        the loss, and of how far the remaining fraction of the object's relief is below
+        a half; see `_relief`.
         """
         if self.minimise or not self.seek:
             return super().score(output, truth)
@@ -357,7 +364,8 @@ class Depth(Task):
         truth: DepthTruth,
         function: Callable[[Tensor], Tensor],
     ) -> Tensor:
-        """Apply a function to the log factors of the object's pixels in each image, (N,).
+        """Apply a function to the log factors of the object's pixels in each image,
+        (N,).
 
         The value is -1 if the object is out of view.
         """
@@ -388,8 +396,8 @@ class Depth(Task):
         return (-log_ratio if is_inverse else log_ratio) + nan_anywhere
 
     def _align(self, depth_map: DepthMap, truth: DepthTruth) -> tuple[Tensor, bool]:
-        """Return the predicted z-depth of every pixel in units of the truth, (H, W), or its
-        inverse; and whether it is the inverse.
+        """Return the predicted z-depth of every pixel in units of the truth, (H, W), or
+        its inverse; and whether it is the inverse.
 
         A map is resized as transformers does it in `post_process_depth_estimation`.
         """
@@ -412,9 +420,9 @@ class Depth(Task):
     def _relief(self, log_factors: Tensor, truth: DepthTruth) -> Tensor:
         """Compute the remaining fraction of the object's relief, ().
 
-        It is 1 if all distances are true, and 0 if the object is as far as what is behind
-        it: the least-squares coefficient over its pixels, in disparity. It is 1 if nothing
-        is known to be behind the object.
+        It is 1 if all distances are true, and 0 if the object is as far as what is
+        behind it: the least-squares coefficient over its pixels, in disparity. It is 1
+        if nothing is known to be behind the object.
         """
         mask = truth.mask
         disparity = truth.z[mask].reciprocal().to(log_factors)

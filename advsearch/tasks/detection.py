@@ -225,8 +225,9 @@ class Detection(ClassTask):
     ) -> Detection:
         """See `Task.after_calibration`: note what is odd about the boxes.
 
-        If there are right boxes and a true one, the box format that fits best is compared
-        with the one in use. Otherwise the strongest boxes are checked for plausibility.
+        If there are right boxes and a true one, the box format that fits best is
+        compared with the one in use. Otherwise the strongest boxes are checked for
+        plausibility.
         """
         task = self._infer_format(output)
         output = task._resolve_grids(output)
@@ -250,7 +251,9 @@ class Detection(ClassTask):
     def _find_boxes_of_classes(
         self, output: Sequence[Detections], classes: Labels
     ) -> Tensor:
-        """Return the boxes (D, 4), as they came, of all images with one of the classes."""
+        """Return the boxes (D, 4), as they came, of all images with one of the
+        classes.
+        """
         selected = []
         for detections in self._resolve_labels(output):
             scores = self._scores_of_classes(detections, classes)
@@ -350,7 +353,8 @@ class Detection(ClassTask):
         is_order_inferred = not self.order
         if self.head_shape and is_order_inferred:
             remarks.append(
-                f"The detector's output of {self.head_shape} is read as a YOLO's: {order}."
+                f"The detector's output of {self.head_shape} is read as a YOLO's: "
+                f"{order}."
             )
         if self.inferred_order in QUERIES and is_order_inferred:
             remarks.append(f"The detector's output is read as a DETR's: {order}.")
@@ -377,7 +381,9 @@ class Detection(ClassTask):
 
     @property
     def _head(self) -> str:
-        """The head of `HEADS` or `QUERIES` that the option `order` names; "" if none."""
+        """The head of `HEADS` or `QUERIES` that the option `order` names; "" if
+        none.
+        """
         if not self.order:
             return ""
         order = " ".join(outputs.parse_order(self.order))
@@ -476,14 +482,16 @@ class Detection(ClassTask):
         return torch.stack(values)
 
     def _score_vanish(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Compute by how much the best right box at the object is below `confidence`."""
+        """Compute by how much the best right box at the object is below
+        `confidence`.
+        """
         right_score = self._scores_of_classes(detections, truth.labels)
         best_score = max_or_zero(right_score, self._is_at_object(detections, truth))
         return self._min_log_odds - compute_log_odds(best_score)
 
     def _score_mislabel(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Compute the lesser of two: that the object vanishes, and that a box at it has a
-        wrong class.
+        """Compute the lesser of two: that the object vanishes, and that a box at it has
+        a wrong class.
         """
         wrong_score = self._scores_of_rivals(self._suppress(detections), truth.labels)
         best_score = max_or_zero(wrong_score, self._is_at_object(detections, truth))
@@ -494,7 +502,8 @@ class Detection(ClassTask):
         """Compute the lesser of two: how far the best overlap of a box that counts is
         below `iou`, and that some box counts.
 
-        The first is scaled so that a small step from `iou` is as long as one in log-odds.
+        The first is scaled so that a small step from `iou` is as long as one in
+        log-odds.
         """
         scores = self._scores_of_classes(detections, truth.labels)
         score_lead = compute_log_odds(max_or_zero(scores)) - self._min_log_odds
@@ -568,8 +577,8 @@ class Detection(ClassTask):
         return min(MIN_SCORE, self.confidence)
 
     def _is_broken(self, detections: Detections) -> bool:
-        """Whether a score or a box that counts is not finite, or all rows are NaN although
-        the model does not fill its outputs with NaN.
+        """Whether a score or a box that counts is not finite, or all rows are NaN
+        although the model does not fill its outputs with NaN.
         """
         has_only_nan_rows = "blank" in detections and not len(detections["boxes"])
         if has_only_nan_rows and not self.fills_with_nan:
@@ -584,7 +593,9 @@ class Detection(ClassTask):
         return suppress(detections, self._min_score, self.suppression)
 
     def _is_elsewhere(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Which boxes neither fit the object nor lie mostly inside its box, (D,) bool."""
+        """Which boxes neither fit the object nor lie mostly inside its box, (D,)
+        bool.
+        """
         boxes = detections["boxes"]
         if truth.box_fractions is None:
             return torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
@@ -606,8 +617,8 @@ class Detection(ClassTask):
     def _is_loosely_on_object(
         self, detections: Detections, truth: DetectionTruth
     ) -> Tensor:
-        """Which boxes are on the object and fit no other thing of its class better, (D,)
-        bool.
+        """Which boxes are on the object and fit no other thing of its class better,
+        (D,) bool.
         """
         boxes = detections["boxes"]
         true_box = truth.box_fractions
@@ -636,8 +647,8 @@ class Detection(ClassTask):
     def _phantom_scores(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Return the score of each box as one where nothing is, (D,).
 
-        The score is that of a target class, or of any class without a target. A loose box
-        of the object's class is no phantom.
+        The score is that of a target class, or of any class without a target. A loose
+        box of the object's class is no phantom.
         """
         right_classes = set(truth.labels)
         if self.target is not None:
@@ -672,8 +683,8 @@ class Detection(ClassTask):
         return scores.sum(dim=1) * 0.0
 
     def _scores_of_rivals(self, detections: Detections, classes: Labels) -> Tensor:
-        """Return the largest score of a target for each box, (D,); without a target, of a
-        class other than these.
+        """Return the largest score of a target for each box, (D,); without a target, of
+        a class other than these.
         """
         if self.target is not None:
             return self._scores_of_classes(detections, self.target)
@@ -708,7 +719,9 @@ class Detection(ClassTask):
         truth: DetectionTruth,
         margins: Sequence[float],
     ) -> list[PredictionWithPayload]:
-        """See `Task.said`: what becomes of the object; the payload has boxes in pixels."""
+        """See `Task.said`: what becomes of the object; the payload has boxes in
+        pixels.
+        """
         results: list[PredictionWithPayload] = []
         for detections in self._read_boxes(output):
             finding = self._match_object(self._suppress(detections), truth)
@@ -809,7 +822,9 @@ class Detection(ClassTask):
     def _describe_match(
         self, finding: ObjectMatch, truth: DetectionTruth
     ) -> Prediction:
-        """Return the prediction about the object, with the score of the deciding box."""
+        """Return the prediction about the object, with the score of the deciding
+        box.
+        """
         class_name = self.get_class_name(finding.index)
         if finding.outcome is None or (truth.box is None and self.seek != "create"):
             return Prediction(OUT_OF_VIEW)
@@ -821,7 +836,9 @@ class Detection(ClassTask):
     def marks(
         self, output: Sequence[Detections], truth: DetectionTruth
     ) -> list[list[Mark]]:
-        """See `Task.marks`: the true box, and every box with a score of `confidence`."""
+        """See `Task.marks`: the true box, and every box with a score of
+        `confidence`.
+        """
         true_marks = []
         if truth.box is not None:
             true_name = " or ".join(self.get_class_names(truth.labels))

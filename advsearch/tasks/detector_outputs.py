@@ -186,7 +186,9 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
 
 
 def _has_mask_rows(grid: Tensor, channels: Collection[int]) -> bool:
-    """Return whether rows (N, D, k) are a box, a score, a class and mask coefficients."""
+    """Return whether rows (N, D, k) are a box, a score, a class and mask
+    coefficients.
+    """
     if grid.shape[2] - 6 not in channels:
         return False
     class_column = grid[..., 5]
@@ -753,10 +755,10 @@ def _is_falling(pairs_of_images: Sequence[Tensor], column: int) -> bool:
 
 # ---- one tensor, as YOLO networks return it ----
 #
-# It is (A, B) for each image: "channels first" (boxes are columns: v8 to v12, YOLO11) or
-# "channels last" (boxes are rows: v5 to v7, YOLOX, RT-DETR). The channels of a box are
-# its center, width and height, in older versions objectness, by which the scores are
-# multiplied, a score of each class, and mask coefficients.
+# It is (A, B) for each image: "channels first" (boxes are columns: v8 to v12, YOLO11)
+# or "channels last" (boxes are rows: v5 to v7, YOLOX, RT-DETR). The channels of a box
+# are its center, width and height, in older versions objectness, by which the scores
+# are multiplied, a score of each class, and mask coefficients.
 
 
 def find_head_orders(
@@ -768,8 +770,8 @@ def find_head_orders(
 
     Args:
         returned: the output.
-        map_channels: numbers of channels of feature maps that came with it, which may be
-            mask coefficients.
+        map_channels: numbers of channels of feature maps that came with it, which may
+            be mask coefficients.
         classes: number of classes.
         order: one of `HEADS`, with or without a layout, that narrows the orders.
 

@@ -25,8 +25,8 @@ class Rig(tasks.JointTask):
     """Combine the predictions about the images of several cameras in one configuration.
 
     Each image has its own truth, such as the box in it. The loss of the rig is the
-    smallest, the largest or the mean of the losses of its images, or for `vote` the one that
-    more than half of them are at or below.
+    smallest, the largest or the mean of the losses of its images, or for `vote` the one
+    that more than half of them are at or below.
 
     Args:
         task: of each image: a name, or a mapping with a `name` and options.
@@ -120,7 +120,9 @@ class Rig(tasks.JointTask):
         return self._combine(self._map_images(self.part.loss, output, truth))
 
     def score(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> Tensor:
-        """See `Task.score`: a target is reached, and a right prediction made, by the rule."""
+        """See `Task.score`: a target is reached, and a right prediction made, by the
+        rule.
+        """
         scores = self._map_images(self.part.score, output, truth)
         if self.target is not None or self.minimise:
             return -self._combine(-scores)
@@ -199,7 +201,9 @@ class Rig(tasks.JointTask):
     def _deciding(
         self, judgements: Sequence[tasks.Judgement], margin: float
     ) -> tasks.Judgement:
-        """Return the judgement that decides by the rule; for the mean, the worst one."""
+        """Return the judgement that decides by the rule; for the mean, the worst
+        one.
+        """
         if self.rule == "mean":
             return min(judgements, key=lambda judgement: judgement.margin)
         return min(judgements, key=lambda judgement: abs(judgement.margin - margin))

@@ -40,8 +40,8 @@ class SegmentationTruth:
     def resize_mask(self, size: tuple[int, int]) -> Tensor:
         """Resize the mask to the size of an output, (h, w) bool.
 
-        A pixel is the object's if at least half of it is; if there is no such pixel, all
-        that contain a part of the object are.
+        A pixel is the object's if at least half of it is; if there is no such pixel,
+        all that contain a part of the object are.
         """
         if self.mask.shape == size:
             return self.mask
@@ -55,8 +55,8 @@ class SegmentationTruth:
 class Segmentation(tasks.ClassTask):
     """Judge whether at least `accuracy` of the object's pixels get a right class.
 
-    Other pixels do not count. If the object is out of view there is nothing to segment, and
-    every prediction is right.
+    Other pixels do not count. If the object is out of view there is nothing to segment,
+    and every prediction is right.
 
     Raises:
         InputError: `accuracy` is no fraction between 0 and 1.
@@ -107,15 +107,17 @@ class Segmentation(tasks.ClassTask):
     def loss(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
         """Compute the lead of wrong classes at the deciding pixel, in logits, (N,).
 
-        It is over 0 if too few pixels are right. Of the object's pixels in the order of that
-        lead, the deciding one is that at which `accuracy` of them is reached.
+        It is over 0 if too few pixels are right. Of the object's pixels in the order of
+        that lead, the deciding one is that at which `accuracy` of them is reached.
         """
         return self._compute_deciding_lead(
             output, truth, tasks.compute_wrong_lead, truth.labels
         )
 
     def score(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
-        """See `Task.score`; with a target, enough of the object's pixels have to get it."""
+        """See `Task.score`; with a target, enough of the object's pixels have to get
+        it.
+        """
         if self.target is None:
             return super().score(output, truth)
         return -self._compute_deciding_lead(
@@ -144,7 +146,9 @@ class Segmentation(tasks.ClassTask):
     def _compute_deciding_lead(
         self, output: Tensor, truth: SegmentationTruth, lead: Lead, labels: tasks.Labels
     ) -> Tensor:
-        """Compute the lead at the pixel at which `accuracy` of them is reached, (N,)."""
+        """Compute the lead at the pixel at which `accuracy` of them is reached,
+        (N,).
+        """
         pixels = self._object_logits(output, truth)
         if pixels is None:
             return _make_hidden_value(output)
@@ -198,10 +202,11 @@ class Segmentation(tasks.ClassTask):
     ) -> list[tasks.PredictionWithPayload]:
         """See `Task.said`: the class of most of the object's pixels.
 
-        If too few are right, it is the most frequent wrong class; if that is background,
-        "no bottle", or "bottle in part" from `MIN_PARTIAL_ACCURACY` on. The probability is the
-        fraction of the object's pixels that are right. The payload has the outcome, the
-        fractions of the pixels by class, and the intersection over union.
+        If too few are right, it is the most frequent wrong class; if that is
+        background, "no bottle", or "bottle in part" from `MIN_PARTIAL_ACCURACY` on. The
+        probability is the fraction of the object's pixels that are right. The payload
+        has the outcome, the fractions of the pixels by class, and the intersection over
+        union.
         """
         results: list[tasks.PredictionWithPayload] = []
         mask = truth.resize_mask((output.shape[2], output.shape[3])).to(output.device)

@@ -51,7 +51,9 @@ class Gallery:
     head: tuple[Tensor, Tensor] | None = field(default=None, repr=False)
 
     def compute_cosines(self, features: Tensor) -> Tensor:
-        """Compute the cosines (N, R) between features (N, D) of length 1 and each image."""
+        """Compute the cosines (N, R) between features (N, D) of length 1 and each
+        image.
+        """
         return features @ self.features.to(features).T
 
 
@@ -87,8 +89,8 @@ def embed_gallery(folder: str, model: Model, *, linear: bool) -> Gallery:
         linear: fit a linear head on the features.
 
     Raises:
-        InputError: as for `list_name_folders`; a name without an image; too many images;
-            features that are not (N, D).
+        InputError: as for `list_name_folders`; a name without an image; too many
+            images; features that are not (N, D).
         FileFormatError: a file that is no image, or a huge one.
     """
     named_folders = list_name_folders(folder)
@@ -154,8 +156,8 @@ def fit_linear_head(features: Tensor, name_index: Tensor) -> tuple[Tensor, Tenso
     """Fit a multinomial logistic regression of names on features.
 
     Names have equal weights, however many images they have. The loss is convex, so its
-    minimum is unique; it is found by L-BFGS from zero in float64, as Radford et al. 2021
-    (arXiv 2103.00020, section A.3) fit theirs.
+    minimum is unique; it is found by L-BFGS from zero in float64, as Radford et al.
+    2021 (arXiv 2103.00020, section A.3) fit theirs.
 
     Args:
         features: (R, D).
@@ -225,8 +227,8 @@ def _crop_center(image: Tensor, size: tuple[int, int]) -> Tensor:
 METHODS = ("nearest", "linear")  # how features become logits
 
 TEMPERATURE = 0.07
-"""Cosines are divided by it to be logits (Wu et al. 2018, arXiv 1805.01978, section 4.1;
-Caron et al. 2021, arXiv 2104.14294, section 4.1).
+"""Cosines are divided by it to be logits (Wu et al. 2018, arXiv 1805.01978, section
+4.1; Caron et al. 2021, arXiv 2104.14294, section 4.1).
 """
 
 ITSELF = "itself"
@@ -236,16 +238,18 @@ SOMETHING_ELSE = "something else"
 
 @dataclass(frozen=True, kw_only=True)
 class Similarity(tasks.Classification):
-    """Judge whether the object is what the nearest reference images show, or the clean one.
+    """Judge whether the object is what the nearest reference images show, or the clean
+    one.
 
-    The output is features (N, D) of any length. With `references` the truth is the indices
-    of the right names, and logits (N, names) are computed from the features by `method`:
+    The output is features (N, D) of any length. With `references` the truth is the
+    indices of the right names, and logits (N, names) are computed from the features by
+    `method`:
 
     - `nearest`: the mean cosine of the `k` nearest images of each name, over
-      `TEMPERATURE`. Each name is scored by its own images, so that a name with many has no
-      more votes than one with few, and every name has a gradient. With k = 1, the default, a
-      prediction is right exactly if the nearest image of all is; a larger k lets no single
-      image decide.
+      `TEMPERATURE`. Each name is scored by its own images, so that a name with many has
+      no more votes than one with few, and every name has a gradient. With k = 1, the
+      default, a prediction is right exactly if the nearest image of all is; a larger k
+      lets no single image decide.
     - `linear`: those of a logistic regression on the reference features, of length 1
       (`fit_linear_head`).
 
@@ -312,7 +316,8 @@ class Similarity(tasks.Classification):
         """See `Task.on`; references are loaded and embedded, unless they are already.
 
         Raises:
-            InputError: there are neither references nor a threshold; or as for `embed_gallery`.
+            InputError: there are neither references nor a threshold; or as for
+                `embed_gallery`.
             FileFormatError: as for `embed_gallery`.
         """
         if not self.references and self.threshold is None:
@@ -342,7 +347,9 @@ class Similarity(tasks.Classification):
         return tuple(name for name, _ in list_name_folders(self.references)), True
 
     def find_right_classes(self, facts: tasks.Facts) -> tasks.Labels:
-        """See `ClassTask.right_classes`; with a threshold the clean image defines what is right."""
+        """See `ClassTask.right_classes`; with a threshold the clean image defines what
+        is right.
+        """
         if self.references:
             return super().find_right_classes(facts)
         if facts.label is not None:
@@ -366,10 +373,11 @@ class Similarity(tasks.Classification):
         return replace(self, clean=features[0])
 
     def read(self, returned: Any, count: int) -> Tensor:
-        """Read features (count, D): a tensor, the first of a tuple, or the first of `PARTS`.
+        """Read features (count, D): a tensor, the first of a tuple, or the first of
+        `PARTS`.
 
-        Of `last_hidden_state` these are of the first token (CLS); a map is averaged over
-        its positions.
+        Of `last_hidden_state` these are of the first token (CLS); a map is averaged
+        over its positions.
 
         Raises:
             ValueError: there are none.
@@ -414,8 +422,8 @@ class Similarity(tasks.Classification):
         return super().as_logits(self.compute_logits(output), truth)
 
     def judge(self, output: Tensor, truth: tasks.Labels) -> list[tasks.Judgement]:
-        """See `Task.judge`; the payload has the cosine to the clean image, or the ranks of
-        the right references (`_rank_references`).
+        """See `Task.judge`; the payload has the cosine to the clean image, or the ranks
+        of the right references (`_rank_references`).
         """
         with torch.no_grad():
             judgements = super().judge(output, truth)

@@ -42,7 +42,9 @@ Outputs = tuple[Any, ...]
 
 @final
 class Ensemble:
-    """Run several models, each with its own preprocessing: the `Model.module` of `join_models`."""
+    """Run several models, each with its own preprocessing: the `Model.module` of
+    `join_models`.
+    """
 
     def __init__(self, models: Sequence[Model]) -> None:
         self.models = tuple(models)
@@ -94,8 +96,8 @@ Truths = tuple[Truth, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class JointTask(Task):
-    """A task made of others, the `judges`: one for each of its truths in order, or one for
-    all.
+    """A task made of others, the `judges`: one for each of its truths in order, or one
+    for all.
     """
 
     varies = True
@@ -136,7 +138,9 @@ def _distinct(groups: Iterable[Iterable[str]]) -> tuple[str, ...]:
 
 
 def make_outcome_payload(judgement: Judgement) -> dict[str, JsonValue]:
-    """Return the outcome of a judgement as a part of a payload; empty if it states none."""
+    """Return the outcome of a judgement as a part of a payload; empty if it states
+    none.
+    """
     outcome = get_outcome(judgement.payload)
     return {} if outcome is None else {OUTCOME: outcome.value}
 
@@ -151,8 +155,8 @@ class EnsembleTask(JointTask):
     """Judge several models, each by its own task and labels.
 
     A prediction is right if all models are right, and a success if it is one for every
-    model. So the loss is the largest of the models' losses, and the score the smallest of
-    their scores.
+    model. So the loss is the largest of the models' losses, and the score the smallest
+    of their scores.
     """
 
     name = "ensemble"
@@ -182,7 +186,8 @@ class EnsembleTask(JointTask):
         """See `Task.on`; if only some tasks take a label, the target is theirs.
 
         Raises:
-            InputError: the model is not from `join_models`, or has not one model per task.
+            InputError: the model is not from `join_models`, or has not one model per
+                task.
         """
         models = model.module.models if isinstance(model.module, Ensemble) else ()
         if len(models) != len(self.parts):
@@ -466,7 +471,8 @@ def make_each_thing_task(task: Task) -> EachThingTask:
     """
     if isinstance(task, EnsembleTask) or task.name not in PER_THING_TASKS:
         raise InputError(
-            f"judge: all is for {' and '.join(PER_THING_TASKS)}, got task {task.name}; judge "
+            f"judge: all is for {' and '.join(PER_THING_TASKS)}, got task {task.name}; "
+            "judge "
             "one thing, by its name"
         )
     attributes = {"name": task.name, "objective": task.objective}

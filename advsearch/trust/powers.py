@@ -100,5 +100,6 @@ class LeftOut(NamedTuple):
         assignment = shlex.quote(f"{self.name}={value_text}")
         return (
             f"{assignment} if you want that, or "
-            f"{self.name}={'null' if default_text is None else default_text} to do without"
+            f"{self.name}={'null' if default_text is None else default_text} to do "
+            "without"
         )

@@ -84,8 +84,8 @@ class ConnectionPool:
 
     Args:
         listening: the socket that listens.
-        answer: serves a connection in a worker's thread; calls `report_waiting` when it begins
-            or ends to wait for the client.
+        answer: serves a connection in a worker's thread; calls `report_waiting` when it
+            begins or ends to wait for the client.
         context: for HTTPS; without it, HTTP.
     """
 
@@ -186,7 +186,8 @@ class ConnectionPool:
     def _end_slow_clients(self, now: float) -> None:
         """End clients whose time is up.
 
-        While others wait, those that have had `SLOW_CLIENT_SECONDS` end too, the slowest first.
+        While others wait, those that have had `SLOW_CLIENT_SECONDS` end too, the
+        slowest first.
         """
         clients = sorted(
             self._connections.copy().values(), key=lambda client: client.since

@@ -41,11 +41,13 @@ VALUES_PER_BOX = 6
 
 @dataclass
 class Boxes:
-    """All boxes of a detector's predictions, and the true ones, of rows with any number.
+    """All boxes of a detector's predictions, and the true ones, of rows with any
+    number.
 
     Attributes:
-        values: `VALUES_PER_BOX` uint16 values a box: x0, y0, x1 and y1 in `BOX_STEPS` of a
-            pixel, index of the name, score in 1/10000 (`NO_PROBABILITY` of true boxes).
+        values: `VALUES_PER_BOX` uint16 values a box: x0, y0, x1 and y1 in `BOX_STEPS`
+            of a pixel, index of the name, score in 1/10000 (`NO_PROBABILITY` of true
+            boxes).
         ends: number of boxes up to and including each row.
         names: index of each name of a class or a thing.
     """
@@ -73,7 +75,9 @@ class Boxes:
         self.values.extend((x0, y0, x1, y1, name_index, score))
 
     def __deepcopy__(self, memo: object) -> Boxes:
-        """Return itself: pandas copies the attributes of a frame with every column it selects."""
+        """Return itself: pandas copies the attributes of a frame with every column it
+        selects.
+        """
         return self
 
 

@@ -159,7 +159,9 @@ def read_asset(name: str) -> str:
 
 
 def make_header(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
-    """Return the header of a page: a line about its subject, the result, and remarks."""
+    """Return the header of a page: a line about its subject, the result, and
+    remarks.
+    """
     return element(
         "header",
         element("p", eyebrow, class_="eyebrow"),
@@ -190,7 +192,9 @@ def _list_html(lines: Sequence[str], css: str) -> Html | None:
 
 
 def subject_html(*parts: tuple[str, str]) -> Html:
-    """Return what a run is about: kinds with names; paths are short, and full on hover."""
+    """Return what a run is about: kinds with names; paths are short, and full on
+    hover.
+    """
     content = list[Html | str]()
     for index, (kind, text) in enumerate(parts):
         separator = ", " if index else ""
@@ -252,7 +256,9 @@ def _cell_class(text: str, share: float | None) -> str:
 
 
 def _interval_bar(bar: tuple[float, float, float] | None) -> Html | None:
-    """Return a bar from a lower to an upper fraction of the width, with a mark on it."""
+    """Return a bar from a lower to an upper fraction of the width, with a mark on
+    it.
+    """
     if bar is None:
         return None
     lower, upper, mark = bar

@@ -1,4 +1,5 @@
-"""`report.html` of any run: the page of its experiment, or its result laid out as a page.
+"""`report.html` of any run: the page of its experiment, or its result laid out as a
+page.
 
 The object of an attack can be rotated there: `object.js` draws the run's binary glTF.
 """
@@ -189,7 +190,9 @@ _HINT = (
 
 
 def read_object(run: Path) -> bytes:
-    """Read a run's object as binary glTF; empty if there is none that can be embedded."""
+    """Read a run's object as binary glTF; empty if there is none that can be
+    embedded.
+    """
     try:
         data = read_bytes(run / OBJECT_FILE, "an object to turn", MAX_OBJECT_BYTES)
     except (OSError, FileFormatError):
@@ -310,7 +313,9 @@ def make_view_page(
 
 
 def _list_parts(run: Path, parts: list[object]) -> Html | None:
-    """Return a folded list of the runs of a run, linked to their pages if they exist."""
+    """Return a folded list of the runs of a run, linked to their pages if they
+    exist.
+    """
     names = [part for part in parts if isinstance(part, str)]
     if not parts or len(names) < len(parts):
         return None

@@ -1,4 +1,5 @@
-"""`advsearch dashboard`: a small server of the pages of runs, by default for this machine.
+"""`advsearch dashboard`: a small server of the pages of runs, by default for this
+machine.
 
 It responds to GET and HEAD of the list, of a run's page, rows and images, to POST of a
 photograph, and to nothing else. No part of an address becomes a path except a name in
@@ -216,7 +217,9 @@ def make_progress_page(name: str, run: Path) -> str:
 
 
 def _attack_list_html(run: Path) -> Html | None:
-    """Return the list of a study's attacks with links to their pages; None without any."""
+    """Return the list of a study's attacks with links to their pages; None without
+    any.
+    """
     attacks = []
     for path in sorted((run / PARTS).glob("*")):  # attacks of a study
         if path.is_dir():
@@ -278,7 +281,9 @@ def _row_json(row: store.Row) -> dict[str, object]:
 
 FIRST_ROWS = 4_000
 MAX_ROWS = 50_000
-"""Rows of a sweep in one response: of the first, which people wait for, and of others."""
+"""Rows of a sweep in one response: of the first, which people wait for, and of
+others.
+"""
 # maximum bytes of a sweep's columns, and of a run's page
 MAX_COLUMNS_BYTES = 1 << 30
 MAX_PAGE_BYTES = 1 << 28
@@ -292,7 +297,9 @@ THUMBNAIL_PATH = re.compile(r"[0-9]+/[0-9]{1,12}\.jpg")
 
 
 class PhotographServer(Protocol):
-    """What responds for the page on which photographs are aligned with a run's renderings."""
+    """What responds for the page on which photographs are aligned with a run's
+    renderings.
+    """
 
     def make_page(
         self, run: Path, name: str, key: str, other_device_url: str | None
@@ -600,7 +607,9 @@ class _Handler(BaseHTTPRequestHandler):
         raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _serve_run(self, name: str) -> Response:
-        """Return the page of a run: of a sweep, a run in progress, or a finished one."""
+        """Return the page of a run: of a sweep, a run in progress, or a finished
+        one.
+        """
         run = self.server.find_run(name)
         if listing.listed_run(run, counts=False).command == "sweep":
             page = make_sweep_page(
@@ -676,7 +685,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Read the body of a request.
 
         Raises:
-            Refused: if its length is missing, wrong or more than `clients.LARGEST_SENT`.
+            Refused: if its length is missing, wrong or more than
+                `clients.LARGEST_SENT`.
         """
         length = self.headers.get("Content-Length", "")
         if not re.fullmatch(r"[0-9]{1,15}", length):

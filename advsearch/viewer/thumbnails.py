@@ -120,7 +120,8 @@ class Thumbnails:
 
     Attributes:
         run: directory of the run.
-        configurations_per_image: number of consecutive configurations that share an image.
+        configurations_per_image: number of consecutive configurations that share an
+            image.
         is_subset: whether only a subset of the images has thumbnails.
     """
 

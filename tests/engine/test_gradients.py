@@ -520,8 +520,8 @@ def test_a_cosine_counts_only_where_converged_gradients_agree(cosine: float, con
 
 
 def test_a_noisy_reference_only_lowers_a_cosine() -> None:
-    """The bound of `MIN_AGREEMENT`: working gradients of cosine 0.95 with the truth, references of noise as large as makes two
-    agree to a half. What is measured stays below, and below the bound times 0.95."""
+    """The bound of `MIN_AGREEMENT`: working gradients of cosine 0.95 with the truth, references
+    of noise as large as makes two agree to a half. What is measured stays below, and below the bound times 0.95."""
     generator = torch.Generator().manual_seed(3)
     truth, n = torch.randn(50, generator=generator), 50
     noise = float(truth.norm()) / n**0.5  # as large as the truth: two such references have a cosine of a half

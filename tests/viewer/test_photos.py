@@ -64,7 +64,8 @@ def post(
     """The answer to a photograph, sent as the page does; headers that are None are left out."""
     host, name = f"127.0.0.1:{server.server_port}", unquote([*path.split("/"), "", ""][2])
     given: dict[str, str | None] = {
-        "Origin": f"{server.scheme}://{host}", "X-Advsearch-Key": server.make_key(name), "Content-Length": str(len(data)),
+        "Origin": f"{server.scheme}://{host}", "X-Advsearch-Key": server.make_key(name),
+        "Content-Length": str(len(data)),
         **{name.replace("_", "-"): text for name, text in headers.items()},
     }  # fmt: skip
     context = ssl._create_unverified_context() if secure else None

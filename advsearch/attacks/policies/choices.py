@@ -52,8 +52,8 @@ Racing = TypeVar("Racing", bound="Race")
 @dataclass(frozen=True, eq=False)
 class Race:
     """Where a race of so many steps and rounds stands: the numbers of those that are in
-    this round, the best first (`active_runners`), renders that the evaluations so far took, and
-    the searches whose proposals wait for theirs (`runner_of_proposal`).
+    this round, the best first (`active_runners`), renders that the evaluations so far
+    took, and the searches whose proposals wait for theirs (`runner_of_proposal`).
     """
 
     runners: tuple[Runner, ...]

@@ -48,7 +48,9 @@ class Ranges:
     is_periodic: Tensor
 
     def compute_offset(self, x: Tensor, mean: Tensor) -> Tensor:
-        """Return the offset of x from a mean; of an angle the shorter, within a half."""
+        """Return the offset of x from a mean; of an angle the shorter, within a
+        half.
+        """
         offset = x - mean
         wrapped_offset = torch.remainder(offset + 0.5, 1.0) - 0.5
         return torch.where(self.is_periodic, wrapped_offset, offset)
@@ -283,8 +285,8 @@ class Mixture(Policy[MixtureState]):
     density that they came from (the balance heuristic of Veach and Guibas 1995).
 
     Its result is a failure for each component, and with the share of all configurations
-    that fail: see `estimate_failure_rate`. That share is of single renders with the search's
-    samples. In an l2 ball no share is told.
+    that fail: see `estimate_failure_rate`. That share is of single renders with the
+    search's samples. In an l2 ball no share is told.
 
     Attributes:
         components: of the mixture, 1 to 20.

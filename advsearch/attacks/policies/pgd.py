@@ -173,9 +173,9 @@ class Ascent:
     """Where an ascent of so many evaluations stands: u (d,) to propose next, the
     accumulated gradient (d,), of Adam its mean and the mean (d,) of squares, the step
     size, the best evaluation, evaluations so far (`count`), gradients in these means
-    (`n_updates`), zero gradients in a row (`flat`), and lengths of gradients as `clip_gradient`
-    wants them. PGD has besides the objective at the start, a window, and windows in a
-    row that added nothing (`idle`, without noise only).
+    (`n_updates`), zero gradients in a row (`flat`), and lengths of gradients as
+    `clip_gradient` wants them. PGD has besides the objective at the start, a window,
+    and windows in a row that added nothing (`idle`, without noise only).
     """
 
     domain: Domain
@@ -280,9 +280,9 @@ class PGD(AscentPolicy):
         m <- momentum * m + g / mean|g|                (MI-FGSM, Dong et al. 2018, eq. 6)
         u <- P(u + step_size * steepest(m))
 
-    g is clipped first (see `clip_gradient`). Accumulating gradients before the sign is taken
-    matters here: each comes from another seed, and the sign of one noisy gradient is a
-    coin toss wherever the noise exceeds it.
+    g is clipped first (see `clip_gradient`). Accumulating gradients before the sign is
+    taken matters here: each comes from another seed, and the sign of one noisy gradient
+    is a coin toss wherever the noise exceeds it.
 
     The step size is halved at checkpoints when the objective stalls, by the two
     conditions of Auto-PGD (Croce and Hein 2020, section 3.1; see `Window.stalled`).
@@ -301,8 +301,8 @@ class PGD(AscentPolicy):
     An evaluation with the objective -inf sends the search back to its best
     configuration, which is evaluated again and left with half the step size. A gradient
     of zero leaves the accumulated one in charge; if that is zero too, the step goes in
-    a random direction; and after `MAX_FLAT_GRADIENTS` zero gradients in a row there is nothing
-    more to propose.
+    a random direction; and after `MAX_FLAT_GRADIENTS` zero gradients in a row there is
+    nothing more to propose.
 
     Attributes:
         step_size: the first step in units of each block's radius (epsilon; half the
@@ -423,10 +423,10 @@ class Adam(AscentPolicy):
     mean over the block, since there the best step for a constant gradient is along it
     and not along its signs.
 
-    g is clipped first (see `pgd.clip_gradient`). An evaluation without a gradient goes on
-    along m. One whose objective could not be computed sends the search back to its best
-    configuration, with m = v = 0 and half the rate. While there is no gradient but zero
-    the step is random; after five zero gradients in a row there is nothing more to
+    g is clipped first (see `pgd.clip_gradient`). An evaluation without a gradient goes
+    on along m. One whose objective could not be computed sends the search back to its
+    best configuration, with m = v = 0 and half the rate. While there is no gradient but
+    zero the step is random; after five zero gradients in a row there is nothing more to
     propose.
 
     Attributes:

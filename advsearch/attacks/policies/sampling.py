@@ -108,7 +108,8 @@ class Sobol(NonAdaptivePolicy):
         size = domain.dim + sum(block.norm == "l2" for block in domain.blocks)
         if size > MAX_SOBOL_DIM:
             raise InputError(
-                f"policy 'sobol': expected at most {MAX_SOBOL_DIM} dimensions, got {size}; use "
+                f"policy 'sobol': expected at most {MAX_SOBOL_DIM} dimensions, got "
+                f"{size}; use "
                 "policy random, nes, pgd or auto"
             )
         seed = draw_seed(generator)

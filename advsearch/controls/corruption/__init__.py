@@ -78,7 +78,9 @@ def pixelate(image: Tensor, severity: int) -> Tensor:
 
 
 def jpeg(image: Tensor, severity: int) -> Tensor:
-    """Save as a JPEG file of the severity's quality and read it again; see `compress_jpeg`."""
+    """Save as a JPEG file of the severity's quality and read it again; see
+    `compress_jpeg`.
+    """
     return images.compress_jpeg(image, JPEG[severity - 1])
 
 

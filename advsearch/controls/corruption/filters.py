@@ -3,8 +3,9 @@ severity, blurs, warps.
 
 Hendrycks & Dietterich 2019, arXiv 1903.12261, appendix A; their frost is photographs,
 and here it is grown from noise. Pictures are (H, W, 3) float32 display-referred sRGB in
-[0, 1]. Lengths in the tables are pixels of a picture whose smaller side has `REFERENCE_SIDE`
-pixels. Noise is one fixed draw, chosen by the seed: the same at every severity.
+[0, 1]. Lengths in the tables are pixels of a picture whose smaller side has
+`REFERENCE_SIDE` pixels. Noise is one fixed draw, chosen by the seed: the same at every
+severity.
 """
 
 from __future__ import annotations
@@ -61,7 +62,8 @@ def interpolate_table(
 def interpolate_severity(
     level: Tensor, make_at_severity: Callable[[int], Tensor]
 ) -> Tensor:
-    """Mix what `make_at_severity` returns for the whole severities below and above a severity.
+    """Mix what `make_at_severity` returns for the whole severities below and above a
+    severity.
 
     Args:
         level: () in [1, 5]; the result is differentiable in it, and on its device.
@@ -293,6 +295,14 @@ def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     )
 
 
+def _compute_shifts(origin: Tensor, columns: int) -> Tensor:
+    """Return (2, N), how far to the right and down the origin (N,) of each pixel is."""
+    pixel = torch.arange(len(origin))
+    right = origin % columns - pixel % columns
+    down = origin // columns - pixel // columns
+    return torch.stack([right, down])
+
+
 @lru_cache(maxsize=8)
 def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
     """Return from how far each pixel is taken behind frosted glass.
@@ -304,7 +314,7 @@ def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
         height: of the image.
         width: of the image.
         seed: chooses the neighbors.
-        whole: severity, a whole number.
+        severity: 1 to 5.
 
     Returns:
         (H, W, 2) to the right and down, in pixels of the reference image.
@@ -317,11 +327,8 @@ def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
         jumps = torch.randint(-reach, reach, (rows, columns, 2), generator=source)
         to_neighbor = (jumps[..., 0] * columns + jumps[..., 1]).flatten().tolist()
         _swap_in_neighbors(origins, to_neighbor, rows, columns, reach)
-    origin = torch.tensor(origins)
-    pixel = torch.arange(rows * columns)
-    right = origin % columns - pixel % columns
-    down = origin // columns - pixel // columns
-    shift = torch.stack([right, down]).view(1, 2, rows, columns).float()
+    shift = _compute_shifts(torch.tensor(origins), columns)
+    shift = shift.view(1, 2, rows, columns).float()
     return images.to_image(F.interpolate(shift, (height, width), mode="nearest-exact"))
 
 
@@ -342,7 +349,7 @@ def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     else:
         shift = interpolate_severity(
             severity,
-            lambda whole_severity: _elastic_shift(height, width, seed, whole_severity),
+            lambda level: _elastic_shift(height, width, seed, level),
         )
     return images.warp(image, compute_pixel_scale(image) * shift)
 
@@ -355,7 +362,7 @@ def _elastic_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
         height: of the image.
         width: of the image.
         seed: chooses the wrinkles and the shear.
-        whole: severity, a whole number.
+        severity: 1 to 5.
 
     Returns:
         (H, W, 2) to the right and down, in pixels of the reference image.
@@ -504,7 +511,9 @@ def _feathers(height: int, width: int, source: torch.Generator) -> Tensor:
 def _draw_feather(
     pen: ImageDraw.ImageDraw, start: complex, turn: float, size: float, shine: float
 ) -> None:
-    """Draw one ice needle from a point, with a direction, a size and a shine in [0, 1]."""
+    """Draw one ice needle from a point, with a direction, a size and a shine in [0,
+    1].
+    """
     direction = cmath.rect(1.0, 2.0 * math.pi * turn)
     length = 12.0 + 110.0 * size**3
     _line(pen, start, start + length * direction, shine)

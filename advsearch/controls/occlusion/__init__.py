@@ -232,7 +232,9 @@ class OcclusionControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the poses of all occluders; those that are not used are out of sight."""
+        """Return the poses of all occluders; those that are not used are out of
+        sight.
+        """
         camera = geometry.get_camera_pose(self.scene, so_far).to(values["turn"])
         inputs = {
             f"{self._part_name(option)}.to_world": geometry.make_hidden_pose(camera)
@@ -277,7 +279,8 @@ class OcclusionControl(Control):
         return self.name if len(self._list_options()) == 1 else f"{self.name}-{option}"
 
     def find_placement(self, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
-        """Work out where the occluder goes, with camera and object where others put them.
+        """Work out where the occluder goes, with camera and object where others put
+        them.
 
         Without derivatives.
         """
@@ -292,21 +295,20 @@ class OcclusionControl(Control):
         size, distance = _fit_occluder(
             points, requested["size"], requested_distance, view.near
         )
-        # right, up and forward of a camera that looks at it
-        in_camera = np.stack(
-            [points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size],
-            axis=1,
+        cover = silhouettes.rasterise_silhouette(
+            _to_facing_camera(points, size, distance), mesh.faces
         )
-        cover = silhouettes.rasterise_silhouette(in_camera, mesh.faces)
         if cover is None:
             return _make_hidden_placement(size, distance)
-        axes = silhouettes.compute_center_axes(view.directions)
         passage = silhouettes.Passage(
-            view.directions, cover, axes, requested["direction"]
+            view.directions,
+            cover,
+            silhouettes.compute_center_axes(view.directions),
+            requested["direction"],
         )
         angle = _find_covering_angle(view, passage, requested["coverage"])
         hidden = float(passage.compute_coverage(np.array([angle]))[0])
-        return Placement(axes, angle, size, distance, hidden, False)
+        return Placement(passage.axes, angle, size, distance, hidden, False)
 
 
 # ---- what the camera sees
@@ -320,7 +322,11 @@ def _find_covering_angle(
     Below `EASE_IN_COVERAGE` it slides in from outside of the image.
     """
     outside = silhouettes.find_angle_outside(
-        view.shown, view.rim, passage.cover, passage.axes, passage.direction
+        view.directions_of_image,
+        view.rim,
+        passage.cover,
+        passage.axes,
+        passage.direction,
     )
     angle = passage.find_angle(max(coverage, EASE_IN_COVERAGE), outside)
     if coverage < EASE_IN_COVERAGE:
@@ -340,7 +346,9 @@ class _ObjectView:
     # (N, 3) in which it is visible, each for the same area; None if it is not in the
     # image
     directions: assets.Float64Array | None
-    shown: assets.Float64Array  # (M, 3) directions spread over the full image
+    directions_of_image: (
+        assets.Float64Array
+    )  # (M, 3) directions spread over the full image
     rim: assets.Float64Array  # (K, 3) those at its edge
     near: float  # distance of its nearest vertex from the camera
     far: float  # distance of the middle of its bounding box
@@ -377,7 +385,9 @@ class _ObjectView:
 def _object_in_camera(
     scene: SceneDescription, so_far: Mapping[str, Tensor]
 ) -> assets.Float64Array:
-    """Return the object's vertices (V, 3) to the right, up and forward of the camera."""
+    """Return the object's vertices (V, 3) to the right, up and forward of the
+    camera.
+    """
     camera = geometry.get_camera_pose(scene, so_far).detach().double().cpu().numpy()
     pose = _input_or(so_far, "object.to_world", geometry.object_to_world(scene))
     offsets = _input_or(so_far, "object.offsets", np.zeros(3))
@@ -420,13 +430,14 @@ def _directions_through_lens(
     if cover is None:
         return None
     positions, is_visible = model.project(torch.from_numpy(points * (1.0, -1.0, 1.0)))
-    left, top, right, bottom = 0.0, 0.0, 1.0, 1.0
+    columns = (0.0, 1.0)
+    rows = (0.0, 1.0)
     if bool(is_visible.all()):
         left, top = positions.amin(dim=0).clamp(0.0, 1.0).tolist()
         right, bottom = positions.amax(dim=0).clamp(0.0, 1.0).tolist()
-    directions = _spread_directions(
-        model, (left, right), (top, bottom), silhouettes.RASTER
-    )
+        columns = (left, right)
+        rows = (top, bottom)
+    directions = _spread_directions(model, columns, rows, silhouettes.RASTER)
     hidden = directions[cover.contains(*(directions @ axes.T).T)]
     return hidden if len(hidden) else None
 
@@ -472,8 +483,8 @@ def _fit_occluder(
 ) -> tuple[float, float]:
     """Fit an occluder between the camera and the object.
 
-    It keeps `MIN_CAMERA_DISTANCE` from the camera, and no vertex is farther from the camera than
-    the object's nearest one. It is made smaller where it does not fit.
+    It keeps `MIN_CAMERA_DISTANCE` from the camera, and no vertex is farther from the
+    camera than the object's nearest one. It is made smaller where it does not fit.
 
     Args:
         points: (V, 3) of the occluder, one object size large around the origin.
@@ -500,6 +511,27 @@ def _fit_occluder(
     return size, min(max(distance, nearest), farthest)
 
 
+def _to_facing_camera(
+    points: assets.Float64Array, size: float, distance: float
+) -> assets.Float64Array:
+    """Return points (N, 3) to the right, up and forward of a camera.
+
+    The camera looks at the center of an object from a distance; `size` scales the
+    object's points.
+    """
+    right = points[:, 1] * size
+    up = points[:, 2] * size
+    forward = distance - points[:, 0] * size
+    return np.stack([right, up, forward], axis=1)
+
+
+def _rotate_pair(first: Tensor, second: Tensor, angle: float) -> tuple[Tensor, Tensor]:
+    """Rotate two perpendicular vectors in their plane, the first towards the second."""
+    sine = math.sin(angle)
+    cosine = math.cos(angle)
+    return cosine * first + sine * second, cosine * second - sine * first
+
+
 def _compute_pose(camera: Tensor, placed: Placement, values: Values) -> Tensor:
     """Return the occluder's pose (4, 4).
 
@@ -512,10 +544,7 @@ def _compute_pose(camera: Tensor, placed: Placement, values: Values) -> Tensor:
     # of the image: towards the occluder, and at a right angle
     outwards = torch.cos(direction) * right + torch.sin(direction) * up
     sideways = -torch.sin(direction) * right + torch.cos(direction) * up
-    sine = math.sin(placed.angle)
-    cosine = math.cos(placed.angle)
-    to_occluder = cosine * forward + sine * outwards
-    outwards = cosine * outwards - sine * forward
+    to_occluder, outwards = _rotate_pair(forward, outwards, placed.angle)
     right = torch.cos(direction) * outwards - torch.sin(direction) * sideways
     up = torch.sin(direction) * outwards + torch.cos(direction) * sideways
     turn = torch.deg2rad(values["turn"])

@@ -163,8 +163,8 @@ class Passage:
     def find_angle(self, fraction: float, outside: float) -> float:
         """Find the largest angle at which a fraction is hidden, by bisection.
 
-        The thing comes in from outside, and stops where it first hides as much. If it never
-        does, the angle at which it hides most is returned.
+        The thing comes in from outside, and stops where it first hides as much. If it
+        never does, the angle at which it hides most is returned.
 
         Args:
             fraction: the fraction.

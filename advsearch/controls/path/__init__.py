@@ -144,7 +144,9 @@ class Waypoints:
 
 
 class Start(NamedTuple):
-    """A scene as it is described: poses (4, 4), and the object's middle (3,), float32."""
+    """A scene as it is described: poses (4, 4), and the object's middle (3,),
+    float32.
+    """
 
     camera: Tensor
     middle: Tensor
@@ -296,7 +298,9 @@ class PathControl(Control):
         self.seconds = float(self.chosen["seconds"])  # how long the path takes
 
     def _check_not_set(self, setting: str) -> None:
-        """Check that a choice which files state is not set. Raises InputError: it is."""
+        """Check that a choice which files state is not set. Raises InputError: it
+        is.
+        """
         if setting in self._settings:
             raise InputError(
                 f"{self.name}: {setting}: the file in {self.chosen['path']} says "
@@ -314,7 +318,8 @@ class PathControl(Control):
             raise InputError(
                 f"{self.name}.path: expected {', '.join(PATHS)}, a "
                 f"{' or '.join(PATH_ENDINGS)} file, or two of them as "
-                f"in {APPROACH}{MOVER_SEPARATOR}{ORBIT}, the camera's and the object's, got "
+                f"in {APPROACH}{MOVER_SEPARATOR}{ORBIT}, the camera's and the "
+                "object's, got "
                 f"{name!r}"
             )
         movers = [str(self.chosen["moves"])] if alone else MOVERS
@@ -450,7 +455,8 @@ class PathControl(Control):
         positions, rotations = trajectory.orient(axes, up, origin)
         if np.abs(positions).max() > MAX_DISTANCE:
             raise errors.FileFormatError(
-                f"{path}: expected positions within {MAX_DISTANCE:g} of the object, got "
+                f"{path}: expected positions within {MAX_DISTANCE:g} of the object, "
+                "got "
                 "larger ones; object_at says where "
                 "that is in the file's world"
             )
@@ -505,7 +511,8 @@ class PathControl(Control):
         shortest = min(durations, default=self.seconds)
         if len(self._paths) > 1 and shortest < self.seconds:
             notes.append(
-                f"path: the shortest of the files takes {_format_rounded(shortest)} s of "
+                f"path: the shortest of the files takes {_format_rounded(shortest)} s "
+                "of "
                 f"{_format_rounded(self.seconds)}; who "
                 "has arrived waits, and these frames count"
             )
@@ -675,7 +682,9 @@ class PathControl(Control):
     def _camera_on_waypoints(
         self, waypoints: Waypoints, center: Tensor, time: Tensor, shift: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return where the camera is on waypoints, and what it looks at; see `_position_camera`."""
+        """Return where the camera is on waypoints, and what it looks at; see
+        `_position_camera`.
+        """
         position = (
             center
             + waypoints.interpolate(time, waypoints.positions) / self.scene.metres
@@ -690,7 +699,9 @@ class PathControl(Control):
     def _shift_object(
         self, movements: MovementByMover, scene_start: Start, time: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return how far the object is shifted, and the degrees that it is turned by."""
+        """Return how far the object is shifted, and the degrees that it is turned
+        by.
+        """
         camera = scene_start.camera
         movement = movements.get(OBJECT)
         no_shift = camera.new_zeros(3)
@@ -844,8 +855,8 @@ def unwrap_headings(
     low = float(degrees.min())
     high = float(degrees.max())
     jumps = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
-    is_one_turn = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
-    if not len(jumps) or high - low >= 360.0 or not is_one_turn:
+    is_full_turn = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
+    if not len(jumps) or high - low >= 360.0 or not is_full_turn:
         return degrees, None
     first = f"{degrees[jumps[0]]:g}"
     last = f"{degrees[jumps[0] + 1]:g}"
@@ -882,6 +893,17 @@ def _read_text(path: Path) -> str:
         ) from error
 
 
+def _list_optional_columns(mover: str, is_single_path: bool) -> tuple[str, ...]:
+    """Return the columns that a table of waypoints may have besides time and
+    position.
+    """
+    if mover == OBJECT:
+        return (HEADING_COLUMN,)
+    if is_single_path:
+        return (*TARGET_COLUMNS, *OBJECT_SHIFT_COLUMNS, OBJECT_HEADING_COLUMN)
+    return TARGET_COLUMNS
+
+
 def read_waypoints(
     path: Path, mover: str, *, text: str, is_single_path: bool = True
 ) -> dict[str, Waypoints]:
@@ -892,33 +914,24 @@ def read_waypoints(
         mover: the camera or the object, which the file is about.
         text: of a .csv file with the columns time, x, y, z, and look_x, look_y, look_z
             or heading.
-        is_single_path: whether a file about the camera may say what the object does at the same
-            times.
+        is_single_path: whether a file about the camera may say what the object does at
+            the same times.
 
     Raises:
         FileFormatError: it is no table of numbers with the columns that a path needs,
             or its times do not ascend.
     """
-    optional: tuple[str, ...]
-    if mover == OBJECT:
-        optional = (HEADING_COLUMN,)
-    elif is_single_path:
-        optional = (*TARGET_COLUMNS, *OBJECT_SHIFT_COLUMNS, OBJECT_HEADING_COLUMN)
-    else:
-        optional = TARGET_COLUMNS
     header, rows = _read_csv(path, text)
-    _check_header(path, header, optional)
+    _check_header(path, header, _list_optional_columns(mover, is_single_path))
     table = _parse_numbers(path, header, rows)
-    times = table[:, header.index(TIME_COLUMN)] - table[0, header.index(TIME_COLUMN)]
+    column = {name: table[:, index] for index, name in enumerate(header)}
+    times = column.pop(TIME_COLUMN)
+    times = times - times[0]
     check_times(path, times)
-    column = {
-        name: table[:, index]
-        for index, name in enumerate(header)
-        if name != TIME_COLUMN
-    }
     if not all(np.abs(values).max() <= MAX_DISTANCE for values in column.values()):
         raise errors.FileFormatError(
-            f"{path}: expected numbers within {MAX_DISTANCE:g}, got larger ones, or none"
+            f"{path}: expected numbers within {MAX_DISTANCE:g}, got larger ones, or "
+            "none"
         )
     notes = _unwrap_headings(path, column)
 

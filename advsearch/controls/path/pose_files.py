@@ -252,7 +252,9 @@ def _read_named_columns(
 def _find_time_unit(
     path: Path, name: str, times: assets.Float64Array, notes: list[str]
 ) -> str:
-    """Return the unit of a column of times; note it where the name does not state it."""
+    """Return the unit of a column of times; note it where the name does not state
+    it.
+    """
     stated = UNIT.search(name)
     if stated:
         unit = stated[1].strip()
@@ -293,7 +295,8 @@ def _read_kitti(path: Path, rows: Sequence[Sequence[str]]) -> Trajectory:
     error = np.where(np.linalg.det(matrices) > 0.0, error, np.inf)
     if error.max() > ROTATION_TOLERANCE:
         raise errors.FileFormatError(
-            f"{path}: pose {int(error.argmax()) + 1}: expected a rotation and a shift (3 "
+            f"{path}: pose {int(error.argmax()) + 1}: expected a rotation and a shift "
+            "(3 "
             "rows of 4), got another map"
         )
     rotations = Rotation.from_matrix(matrices)

@@ -119,7 +119,8 @@ class ProjectorControl(PictureControl):
             "lumens",
             0.0,
             1e6,
-            f"{DEFAULT_LUMENS:g}, or what is {MAX_AMBIENT_FACTOR:g} times as bright as the place",
+            f"{DEFAULT_LUMENS:g}, or what is {MAX_AMBIENT_FACTOR:g} times as bright as "
+            "the place",
             "Light of a white picture.",
         ),
         _lit(
@@ -238,7 +239,8 @@ class ProjectorControl(PictureControl):
         ]
         if conflicting:
             raise InputError(
-                f"{self.name}.{conflicting[0]}: expected none beside {self.name}.picture; "
+                f"{self.name}.{conflicting[0]}: expected none beside "
+                f"{self.name}.picture; "
                 "leave one of them out"
             )
 
@@ -283,7 +285,9 @@ class ProjectorControl(PictureControl):
         return scene.with_part(part)
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter with its default beside the scene's camera, in its light."""
+        """Return a parameter with its default beside the scene's camera, in its
+        light.
+        """
         parameter = super().resolve_parameter(parameter)
         scene = self.scene
         camera_offset = geometry.camera_to_world(scene)[
@@ -378,7 +382,7 @@ class ProjectorControl(PictureControl):
 
     @property
     def ambient(self) -> float | None:
-        slot = next(one for one in self.slots if one.parameter.name == "ambient")
+        slot = next(slot for slot in self.slots if slot.parameter.name == "ambient")
         return float(slot.spec.value) if isinstance(slot.spec, Fixed) else None
 
     def scale_ambient(self, factor: float) -> Self:

@@ -1,7 +1,7 @@
 """Measure gradients of a scene, and plan how a search gets them (docs/gradients.md).
 
-    bench = gradients.Bench(renderer, loss, gradients.find_interior_point(renderer), seed=0,
-    spp=16) rows = list(gradients.measure_derivatives(bench, reference_spp=64,
+    bench = gradients.Bench(renderer, loss, gradients.find_interior_point(renderer),
+    seed=0, spp=16) rows = list(gradients.measure_derivatives(bench, reference_spp=64,
     seeds_of_reference=(6, 16)))
 
 A `Bench` takes gradients of a loss, by any plan. `derivatives` compares estimators with

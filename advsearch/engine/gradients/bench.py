@@ -141,7 +141,9 @@ class Bench:
     def _measure_gradient(
         self, plan: GradientPlan, stream: str, index: int
     ) -> dict[str, Any]:
-        """Return the derivatives of a gradient as JSON, with the seconds that it took."""
+        """Return the derivatives of a gradient as JSON, with the seconds that it
+        took.
+        """
         started = time.perf_counter()
         gradient = self.compute_gradient(plan, seeds.stream(self.seed, stream, index))
         derivatives = torch.cat(

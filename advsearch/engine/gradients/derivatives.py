@@ -124,13 +124,13 @@ def compare_with_reference(
 ) -> Measured:
     """Say how good an estimate is along a probe, from so many samples a pixel:
     "reference unusable" where the reference's noise exceeds `MAX_NOISE` and doubt
-    (`N_STANDARD_ERRORS` standard errors of both) covers the error; "biased" where the error of
-    the mean exceeds `MAX_BIAS` beyond doubt; "noisy" where the noise exceeds `MAX_NOISE`;
-    otherwise "ok".
+    (`N_STANDARD_ERRORS` standard errors of both) covers the error; "biased" where the
+    error of the mean exceeds `MAX_BIAS` beyond doubt; "noisy" where the noise exceeds
+    `MAX_NOISE`; otherwise "ok".
 
-    The size that this is relative to is the reference's, or `MIN_SIZE_FRACTION` of the largest of
-    the `others` of its control: a derivative that happens to be near zero has no size
-    of its own to speak of.
+    The size that this is relative to is the reference's, or `MIN_SIZE_FRACTION` of the
+    largest of the `others` of its control: a derivative that happens to be near zero
+    has no size of its own to speak of.
     """
     size = max(
         [
@@ -366,8 +366,8 @@ def measure_derivatives(
     Args:
         reference_spp, seeds_of_reference, reference_factors: as `spp` of the bench, and
             as `repeats` and `factors` of `measure_reference`.
-        list_tries: from a group the estimators to try, by default as planned, with multiples
-            of the step; a wider one on what is not `ok` yet.
+        list_tries: from a group the estimators to try, by default as planned, with
+            multiples of the step; a wider one on what is not `ok` yet.
         repeats: gradients by an estimator at first, and by one with another step, which
             has to be surer.
         stage: is told what begins and of how many steps.

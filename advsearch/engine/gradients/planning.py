@@ -1,8 +1,8 @@
 """Choose how gradients are computed, by measurements on the scene.
 
 - Estimators: those with the least squared error x time.
-- Steps and sample counts: the cheapest whose gradients have a cosine of `GOAL_COSINE` with the
-  converged gradient of the model's own loss (docs/gradients.md).
+- Steps and sample counts: the cheapest whose gradients have a cosine of `GOAL_COSINE`
+  with the converged gradient of the model's own loss (docs/gradients.md).
 - Bounces of light: as many as change the image. Paths of other lengths with one seed
   are the same, cut off earlier.
 """
@@ -90,10 +90,10 @@ def list_contested(
 ) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
     """Return groups of one control with the estimators to compare on them.
 
-    There is more than one estimator, and none was forced. If `with_all`, these are all such
-    groups; else only those for which the interior adjoint is preferred so far: over
-    poses, the model's loss is so rough that no estimator has won, and over shapes the
-    material form is the quietest.
+    There is more than one estimator, and none was forced. If `with_all`, these are all
+    such groups; else only those for which the interior adjoint is preferred so far:
+    over poses, the model's loss is so rough that no estimator has won, and over shapes
+    the material form is the quietest.
     """
     open_groups = []
     for group in plan.groups:
@@ -166,8 +166,8 @@ def _score_estimators(
 ) -> dict[str, float]:
     """Return squared error x seconds of each estimator on groups of one control.
 
-    The reference is the mean of the differences among the estimators, whose own noise is
-    subtracted from the errors of the others.
+    The reference is the mean of the differences among the estimators, whose own noise
+    is subtracted from the errors of the others.
     """
     group_names = {group.name for group in groups}
     gradients_of = dict[str, Tensor]()
@@ -237,7 +237,9 @@ def _explain_scores(
 def count_cosine_samples(
     plan: GradientPlan, *, counts: Sequence[int] = SAMPLE_COUNTS
 ) -> int:
-    """Return how many samples per pixel the gradients of `measure_cosines` take at most, in all."""
+    """Return how many samples per pixel the gradients of `measure_cosines` take at
+    most, in all.
+    """
     each = (
         REPEATS * sum(counts) + N_CONVERGED * (1 + CONVERGED_SPP_FACTOR) * CONVERGED_SPP
     )
@@ -262,9 +264,9 @@ def measure_cosines(
 ) -> Iterator[Measured]:
     """Measure the cosine of working gradients with the converged one, for each control.
 
-    Both have the same step. Sample counts are tried in their order until one reaches the
-    goal at a step; then the next step follows. `count_cosine_samples` bounds the samples of
-    all gradients.
+    Both have the same step. Sample counts are tried in their order until one reaches
+    the goal at a step; then the next step follows. `count_cosine_samples` bounds the
+    samples of all gradients.
     """
     base_plan = bench.renderer.plan
     for groups, factors in _list_controls(base_plan):

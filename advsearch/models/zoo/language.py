@@ -40,8 +40,8 @@ MIN_LARGE_WEIGHTS = 500_000_000
 
 
 def generates_text(architecture: str, network: Any) -> bool:
-    """Whether a network of transformers, by its architecture, continues images and texts with
-    text.
+    """Whether a network of transformers, by its architecture, continues images and
+    texts with text.
     """
     transformers: Any = sys.modules["transformers"]
     names = transformers.models.auto.modeling_auto.MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING_NAMES
@@ -165,9 +165,9 @@ def _warn_of_prefixes(
 class _LanguageModel(nn.Module):
     """A network that reads an image and a question, and continues with text.
 
-    `preprocessing` is its `Preprocessing`. A processor that is an affine map is measured and
-    left to that; one that cuts an image into patches or tiles is called itself, which is
-    differentiable with torchvision.
+    `preprocessing` is its `Preprocessing`. A processor that is an affine map is
+    measured and left to that; one that cuts an image into patches or tiles is called
+    itself, which is differentiable with torchvision.
     """
 
     def __init__(self, loaded: LoadedNetwork, processor: Any, question: str) -> None:
@@ -178,7 +178,8 @@ class _LanguageModel(nn.Module):
         # `past_key_values` is the older name.
         self.cache = "cache" if "cache" in parameters else "past_key_values"
         self._prompts: dict[tuple[int, int], dict[str, Tensor]] = {}
-        # The question with a placeholder for the image, as the network was trained on it.
+        # The question with a placeholder for the image, as the network was trained on
+        # it.
         self.text = f"{getattr(processor, 'image_token', None) or ''}{question}"
         if getattr(processor, "chat_template", None):
             content = [{"type": "image"}, {"type": "text", "text": question}]
@@ -209,8 +210,8 @@ class _LanguageModel(nn.Module):
         self._check_pixels(loaded.spec)
 
     def _check_pixels(self, spec: str) -> None:
-        """Raise ModelError if the processor treats a floating-point image otherwise than
-        the same image in 8 bits.
+        """Raise ModelError if the processor treats a floating-point image otherwise
+        than the same image in 8 bits.
         """
         height, width = self.image_size
         vertical = torch.linspace(0, 200, height)[:, None]
@@ -270,12 +271,12 @@ class _LanguageModel(nn.Module):
         return self._process(image.float(), do_rescale=False)["pixel_values"]
 
     def tokenize_names(self, names: Sequence[str]) -> list[list[int]]:
-        """Return the tokens of each name after the prompt, with a space between them unless
-        there is one.
+        """Return the tokens of each name after the prompt, with a space between them
+        unless there is one.
 
-        They are the tokens of prompt and name minus those of the prompt. If the text does
-        not begin with the prompt's tokens, as a processor may end a text with a newline,
-        they are those of the name alone.
+        They are the tokens of prompt and name minus those of the prompt. If the text
+        does not begin with the prompt's tokens, as a processor may end a text with a
+        newline, they are those of the name alone.
 
         Raises:
             InputError: the network has no token for a name.
@@ -310,8 +311,8 @@ class _LanguageModel(nn.Module):
         return tokens_of_names
 
     def get_prompt(self, image_size: tuple[int, int]) -> dict[str, Tensor]:
-        """Return the network's inputs for a gray image of (height, width) pixels and the
-        question.
+        """Return the network's inputs for a gray image of (height, width) pixels and
+        the question.
         """
         if image_size not in self._prompts:
             self._prompts[image_size] = self._process(
@@ -342,7 +343,8 @@ class _LanguageModel(nn.Module):
         """Run the network on an image and the prompt.
 
         Returns:
-            The logits (tokens,) float32 of the next token, and the cache of keys and values.
+            The logits (tokens,) float32 of the next token, and the cache of keys and
+            values.
 
         Raises:
             ValueError: the network returns no cache.
@@ -354,7 +356,8 @@ class _LanguageModel(nn.Module):
         return returned.logits[0, -1].float(), past
 
     def continue_with(self, tokens: Tensor, past: Any) -> Tensor:
-        """Return the logits (N, L, tokens) float32 of the token after each of N x L tokens.
+        """Return the logits (N, L, tokens) float32 of the token after each of N x L
+        tokens.
 
         `past` is the cache of one image.
         """
@@ -366,11 +369,13 @@ class _LanguageModel(nn.Module):
 
 
 class _NameClassifier(nn.Module):
-    """Compute logits (N, names): the log-likelihood of each name after image and prompt.
+    """Compute logits (N, names): the log-likelihood of each name after image and
+    prompt.
 
-    It is summed over the tokens of the name. Image and prompt are read once. The stem of a
-    name (all of its tokens but the last) is read after them, once for all names that begin
-    with it, and all stems in one batch: names of one token need no further step.
+    It is summed over the tokens of the name. Image and prompt are read once. The stem
+    of a name (all of its tokens but the last) is read after them, once for all names
+    that begin with it, and all stems in one batch: names of one token need no further
+    step.
     """
 
     def __init__(self, reader: _LanguageModel, tokens: Sequence[Sequence[int]]) -> None:
@@ -379,8 +384,8 @@ class _NameClassifier(nn.Module):
         self.tokens = [list(name_tokens) for name_tokens in tokens]
         stems = _find_stems(self.tokens)
         stem_length = max(map(len, stems), default=0)
-        # For each token of a name: the row of likelihoods after the tokens before it, the
-        # token, and whether there is one.
+        # For each token of a name: the row of likelihoods after the tokens before it,
+        # the token, and whether there is one.
         rows = torch.zeros((len(tokens), max(map(len, tokens))), dtype=torch.long)
         columns = torch.zeros_like(rows)
         counts = torch.zeros_like(rows)
@@ -424,8 +429,8 @@ def _find_stem(stems: Sequence[Sequence[int]], prefix: Sequence[int]) -> int:
 
 
 def _find_stems(tokens: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
-    """Return the stems of names, all of their tokens but the last, sorted, without those
-    that are a prefix of another stem.
+    """Return the stems of names, all of their tokens but the last, sorted, without
+    those that are a prefix of another stem.
     """
     stems = {tuple(name_tokens[:-1]) for name_tokens in tokens if len(name_tokens) > 1}
     return sorted(
@@ -473,8 +478,8 @@ class _FreeAnswerer(nn.Module):
         return answers
 
     def find_first_tokens(self, word: str) -> list[int]:
-        """Return the tokens that may begin a word, in lower case or capitalized, with or
-        without a space before it.
+        """Return the tokens that may begin a word, in lower case or capitalized, with
+        or without a space before it.
         """
         first_tokens: set[int] = set()
         for form in {word, word.capitalize(), f" {word}", f" {word.capitalize()}"}:

@@ -189,7 +189,9 @@ def _run_processor(processor: Any, picture: Any, spec: str) -> Array:
 
 
 def _disable_resizing(processor: Any) -> Callable[..., Any]:
-    """Return a processor that neither resizes nor crops, for images of the right size."""
+    """Return a processor that neither resizes nor crops, for images of the right
+    size.
+    """
     switches = ("do_resize", "do_center_crop")
     disabled = {name: False for name in switches if getattr(processor, name, None)}
     return partial(processor, **disabled)
@@ -345,14 +347,16 @@ class LoadedNetwork:
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """The names of its classes in its ``config``; none if transformers only numbers them."""
+        """The names of its classes in its ``config``; none if transformers only numbers
+        them.
+        """
         labels = getattr(self.network.config, "id2label", None) or {}
         names = tuple(str(labels[key]) for key in sorted(labels, key=int))
         return () if all(re.fullmatch(r"LABEL_\d+", name) for name in names) else names
 
     def get_sized_preprocessing(self, config: Any) -> Processing:
-        """Return the preprocessing, with the size in a part of the network's ``config`` if
-        it has none.
+        """Return the preprocessing, with the size in a part of the network's ``config``
+        if it has none.
         """
         size = getattr(config, "image_size", None)
         input_size = (size, size) if isinstance(size, int) else tuple(size or ())
@@ -389,8 +393,8 @@ class LoadedNetwork:
 def are_nearly_equal(
     expected: Tensor, computed: Tensor, size: float, dtype: torch.dtype
 ) -> bool:
-    """Whether a network's own scores and those that we compute from its parts are equal up to
-    rounding in its dtype, relative to a size.
+    """Whether a network's own scores and those that we compute from its parts are equal
+    up to rounding in its dtype, relative to a size.
     """
     return bool(
         (expected - computed).abs().max()
@@ -399,8 +403,8 @@ def are_nearly_equal(
 
 
 def to_pixel_corners(boxes: Tensor, images: Tensor) -> Tensor:
-    """Convert boxes (N, K, 4), center and size as fractions of images (N, 3, H, W), to corners
-    x0, y0, x1, y1 in pixels.
+    """Convert boxes (N, K, 4), center and size as fractions of images (N, 3, H, W), to
+    corners x0, y0, x1, y1 in pixels.
     """
     height, width = images.shape[2:]
     middle, size = boxes.split(2, dim=-1)

@@ -34,10 +34,11 @@ CLASS_TOKEN_NAMES = ("cls_token", "class_embedding", "class_token")
 
 
 def gives_features(architecture: str, network: Any) -> bool:
-    """Whether a network of transformers, or its class, has features of an image and no head.
+    """Whether a network of transformers, or its class, has features of an image and no
+    head.
 
-    Its architecture is a name such as Dinov2Model or CLIPVisionModelWithProjection. None
-    stands for one that transformers does not have.
+    Its architecture is a name such as Dinov2Model or CLIPVisionModelWithProjection.
+    None stands for one that transformers does not have.
     """
     if (
         network is None
@@ -128,8 +129,8 @@ BY_FAMILY = {
     "zoedepth": METRIC,
     "glpn": METRIC,
 }
-"""The kind of a network whose ``config`` does not state it, by family: that of the first
-published weights.
+"""The kind of a network whose ``config`` does not state it, by family: that of the
+first published weights.
 """
 
 
@@ -178,9 +179,10 @@ SENTENCE = "the task is semantic"  # the text input of OneFormer
 def make_mask_source(loaded: LoadedNetwork) -> models.Source:
     """Return the source of a network that returns masks and their classes.
 
-    Its output is the logarithms of scores (N, classes, H, W) of each pixel of the input. The
-    score of a class is the sum over queries of the probability that it is a query's, times
-    the probability that the pixel is in that query's mask (Cheng et al. 2021, arXiv
+    Its output is the logarithms of scores (N, classes, H, W) of each pixel of the
+    input. The score of a class is the sum over queries of the probability that it is a
+    query's, times the probability that the pixel is in that query's mask (Cheng et al.
+    2021, arXiv
     2107.06278, section 3.4, "semantic inference"). Masks are resized at the point at which
     `post_process_semantic_segmentation` of each family resizes them.
 
@@ -231,13 +233,14 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
 
 
 def load_timm(spec: str, purpose: models.Purpose) -> models.Source:
-    """Load ``timm:NAME[@weights.safetensors]``, by default with timm's pretrained weights.
+    """Load ``timm:NAME[@weights.safetensors]``, by default with timm's pretrained
+    weights.
 
     Size, normalization and labels are those of its pretrained weights.
 
     Raises:
-        ModelError: timm is missing, its weights cannot be loaded, or the given ones do not
-            fit.
+        ModelError: timm is missing, its weights cannot be loaded, or the given ones do
+            not fit.
         UnknownNameError: timm has no network of that name.
     """
     name, weights = models.split_weights(spec.partition(":")[2])
@@ -285,8 +288,9 @@ def find_timm_source(
 
 
 def make_wrapped_timm_source(loaded: LoadedNetwork) -> models.Source:
-    """Return the source of a network of timm inside a `TimmWrapperForImageClassification` of
-    transformers, whose ``config`` may have more than timm.
+    """Return the source of a network of timm inside a
+    `TimmWrapperForImageClassification` of transformers, whose ``config`` may have more
+    than timm.
 
     There are no labels if transformers only numbers them.
     """
@@ -353,8 +357,8 @@ def _make_timm_source(
 
 
 MAX_DETECTOR_BATCH = 4
-"""Maximum batch size of a detector: at 800 x 800 each image takes a gigabyte or two with
-its derivative.
+"""Maximum batch size of a detector: at 800 x 800 each image takes a gigabyte or two
+with its derivative.
 """
 
 
@@ -407,7 +411,8 @@ def load_torchvision(spec: str) -> models.Source:
 
 
 def _find_detector_size(module: nn.Module) -> tuple[int, int] | None:
-    """Return the (height, width) to which a detector's transform resizes a square image.
+    """Return the (height, width) to which a detector's transform resizes a square
+    image.
 
     None if it does not state it.
     """

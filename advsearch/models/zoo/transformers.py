@@ -35,8 +35,8 @@ class Family(NamedTuple):
     """Networks of transformers that are loaded and asked alike: `matches` tells them, a
     pattern in the name of an architecture (``DeiTForImageClassificationWithTeacher``),
     or a function of that and the network or its class. The class of transformers that
-    builds them is AutoModel and `loader`, or for None the architecture itself; `make_zero_shot_source`
-    makes the model's source.
+    builds them is AutoModel and `loader`, or for None the architecture itself;
+    `make_zero_shot_source` makes the model's source.
     """
 
     matches: str | Callable[[str, Any], bool]
@@ -57,13 +57,15 @@ ADVICE = (
 
 
 def load(spec: str, purpose: models.Purpose) -> models.Source:
-    """Load ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `NETWORKS`.
+    """Load ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of
+    `NETWORKS`.
 
-    One that reads texts gets its classes from the user (`zero_shot`, `language`). Labels of
-    others are those that they were published with; size, channel order and normalization
-    are measured on the image processor (`import_library.measured`); a ModelWarning reports if there
-    is none. Code in a repository is never run, and weights are read from safetensors alone.
-    A repository that timm has saved goes to timm.
+    One that reads texts gets its classes from the user (`zero_shot`, `language`).
+    Labels of others are those that they were published with; size, channel order and
+    normalization are measured on the image processor (`import_library.measured`); a
+    ModelWarning reports if there is none. Code in a repository is never run, and
+    weights are read from safetensors alone. A repository that timm has saved goes to
+    timm.
 
     Raises:
         ModelError: transformers is missing, the repository cannot be loaded or lacks
@@ -123,11 +125,12 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
 def find_transformers_source(
     network: nn.Module, purpose: models.Purpose
 ) -> models.Source | None:
-    """Return the source of an existing network of transformers; None for any other network.
+    """Return the source of an existing network of transformers; None for any other
+    network.
 
-    Names come from its ``config``, and the preprocessing from the repository or directory
-    that it was loaded from; a ModelWarning reports if that has no image processor, or cannot
-    be read any more.
+    Names come from its ``config``, and the preprocessing from the repository or
+    directory that it was loaded from; a ModelWarning reports if that has no image
+    processor, or cannot be read any more.
     """
     transformers: Any = sys.modules.get("transformers")
     if transformers is None or not isinstance(network, transformers.PreTrainedModel):
@@ -220,14 +223,17 @@ def _load_config(
         raise errors.ModelError(
             f"model {spec}: {name} is no folder here{_suggest_folders(name)}, and no "
             "repository of that name is in the "
-            f"cache{_format_suggestions(models.resembling(name, cached))} or can be had "
+            f"cache{_format_suggestions(models.resembling(name, cached))} or can be "
+            "had "
             f"({models.first_line(error)}). Check the "
             "name and the network, or give a folder"
         ) from error
 
 
 def _is_hub_unreachable(name: str) -> bool:
-    """Whether the hub does not respond about a repository, not even that there is none."""
+    """Whether the hub does not respond about a repository, not even that there is
+    none.
+    """
     hub = import_module("huggingface_hub")
     try:
         hub.get_hf_file_metadata(
@@ -251,8 +257,8 @@ def _suggest_folders(name: str) -> str:
 
 
 def _format_suggestions(names: Sequence[str]) -> str:
-    """Return the question whether one of these directories or repositories is meant, "" if
-    there is none.
+    """Return the question whether one of these directories or repositories is meant, ""
+    if there is none.
     """
     specs = [f"'hf:{name}'" for name in names[:3]]
     return f" (did you mean {' or '.join(specs)}?)" if specs else ""
@@ -290,17 +296,20 @@ def _run_classifier(network: Any, images: Tensor) -> Tensor:
 
 
 def _run_segmenter(network: Any, images: Tensor) -> Tensor:
-    """Return the logits (N, classes, H, W) of a segmenter, at the size of the images."""
+    """Return the logits (N, classes, H, W) of a segmenter, at the size of the
+    images.
+    """
     return interpolate(
         _run_classifier(network, images), size=images.shape[2:], mode="bilinear"
     )
 
 
 def _run_detector(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return boxes (N, queries, 4) in pixels, x0, y0, x1, y1, and scores (N, queries, classes)
-    in [0, 1], without suppression.
+    """Return boxes (N, queries, 4) in pixels, x0, y0, x1, y1, and scores (N, queries,
+    classes) in [0, 1], without suppression.
 
-    Networks whose last class means no object choose one class for each box (Carion et al.
+    Networks whose last class means no object choose one class for each box (Carion et
+    al.
     2020); the others score each class independently.
     """
     returned = network(pixel_values=images)
@@ -335,8 +344,8 @@ class _FrameProcessor:
 
 
 def _make_clip_source(loaded: LoadedNetwork) -> models.Source:
-    """Return the source of a network that takes (N, T, 3, H, W): the T frames are the images of
-    a rig.
+    """Return the source of a network that takes (N, T, 3, H, W): the T frames are the
+    images of a rig.
     """
     config = loaded.network.config
     loaded = replace(

@@ -27,7 +27,9 @@ TEXT_BATCH_SIZE = 64  # texts that are embedded at once
 
 
 def encodes_images_and_texts(network: Any) -> bool:
-    """Whether a network of transformers, or its class, encodes both images and texts."""
+    """Whether a network of transformers, or its class, encodes both images and
+    texts.
+    """
     return all(hasattr(network, f"get_{half}_features") for half in ("image", "text"))
 
 
@@ -94,8 +96,8 @@ def _make_head(network: Any, embeddings: Tensor) -> nn.Linear:
 
 
 def check_takes_pictures(network: Any, spec: str) -> None:
-    """Raise ModelError for a network that takes patches instead of images; `spec` is for the
-    message.
+    """Raise ModelError for a network that takes patches instead of images; `spec` is
+    for the message.
     """
     if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
         raise errors.ModelError(
@@ -107,8 +109,8 @@ def check_takes_pictures(network: Any, spec: str) -> None:
 
 
 def get_spoken_names(names: Sequence[str]) -> list[str]:
-    """Return the text of each name: the first of its synonyms separated by commas, if no
-    other name has the same.
+    """Return the text of each name: the first of its synonyms separated by commas, if
+    no other name has the same.
     """
     first_synonyms = [name.partition(",")[0].strip() or name for name in names]
     return [
@@ -242,8 +244,8 @@ def _check_scores(
 def warn_of_equal_texts(
     tokenizer: Any, texts: Sequence[str], names: Sequence[str], name: str
 ) -> None:
-    """Warn of the first two names with the same tokens: they differ in case, say, or are
-    words that the network does not know.
+    """Warn of the first two names with the same tokens: they differ in case, say, or
+    are words that the network does not know.
     """
     index_of_tokens: dict[tuple[int, ...], int] = {}
     tokens_of_texts = tokenizer(list(texts), verbose=False)["input_ids"]
@@ -266,7 +268,9 @@ x0, y0, x1, y1, and independent scores (N, K, names) in [0, 1].
 
 
 def make_detector_source(loaded: LoadedNetwork) -> models.Source:
-    """Return the source of a detector of the given names, with a network of `DETECTORS`."""
+    """Return the source of a detector of the given names, with a network of
+    `DETECTORS`.
+    """
     names = loaded.purpose.require_names(
         loaded.name, "finds what it is told to", "detection"
     )

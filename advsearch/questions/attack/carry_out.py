@@ -100,8 +100,8 @@ class AttackParts:
         policy: may be the caller's.
         is_stored: whether the run is stored.
         metrics: columns of the rows, by name.
-        clean_matrix: the matrix of light transport of the clean scene, which attacks may
-            share.
+        clean_matrix: the matrix of light transport of the clean scene, which attacks
+            may share.
     """
 
     config: AttackConfig

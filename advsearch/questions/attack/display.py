@@ -194,7 +194,8 @@ def failures_text(failures: DifferentFailures) -> str:
         )
     if failures.share is not None:
         where += (
-            f"; of all configurations {words.interval_text(failures.share.interval)} fail "
+            f"; of all configurations {words.interval_text(failures.share.interval)} "
+            "fail "
             "in one render (95 % interval)"
         )
         if failures.share.estimate is not None:
@@ -202,7 +203,8 @@ def failures_text(failures: DifferentFailures) -> str:
     if not failures.tried:
         return f"claimed in {where}; none of these was tried with fresh renders"
     return (
-        f"claimed in {where}; with fresh renders {failures.held} of the {failures.tried} "
+        f"claimed in {where}; with fresh renders {failures.held} of the "
+        f"{failures.tried} "
         "that were tried hold"
     )
 

@@ -223,7 +223,9 @@ def _make_config(
 
 
 def _open_run(run: str | Path | None, resume: bool, config: AttackConfig) -> Any:
-    """Return a context with the run directory: a stopped run's, a new one's, or None."""
+    """Return a context with the run directory: a stopped run's, a new one's, or
+    None.
+    """
     resumed = None
     if resume and run is not None and is_run(run_path(run)):
         resumed = run_path(run)

@@ -155,7 +155,9 @@ class AttackResult:
 
     @property
     def images(self) -> dict[str, Tensor]:
-        """The images `clean` and `adversarial`: (H, W, 3) display-referred sRGB in [0, 1]."""
+        """The images `clean` and `adversarial`: (H, W, 3) display-referred sRGB in [0,
+        1].
+        """
         return {"clean": self.clean, "adversarial": self.adversarial}
 
     @property
@@ -287,8 +289,8 @@ class AttackResult:
 
 # of all meshes that are written to turn; larger meshes are simplified
 MAX_FACES = 30_000
-# between the centers of the object and of another mesh that is written with it, in units
-# of the object's extent
+# between the centers of the object and of another mesh that is written with it, in
+# units of the object's extent
 MAX_NEAR_DISTANCE = 2.0
 # samples per pixel of the images that are stored if there were no trials
 UNTRIED_SPP = 16

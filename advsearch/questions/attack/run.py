@@ -182,7 +182,9 @@ def _search(
     journal: Journal,
     stages: Stages,
 ) -> Any:
-    """Search for the worst configuration with the settings of the attack, and verify it."""
+    """Search for the worst configuration with the settings of the attack, and verify
+    it.
+    """
     has_trial_count = config.trials is not None or config.smallest
     return search_and_verify(
         policy,

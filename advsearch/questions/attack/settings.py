@@ -177,9 +177,11 @@ class AttackConfig(DerivativeConfig):
         None,
         "search",
         "number of search steps, each of which evaluates one configuration",
-        otherwise=f"{STEPS}; for textures and the like with --over {SIZE_OVER_PREDICTED[0]} "
+        otherwise=f"{STEPS}; for textures and the like with --over "
+        f"{SIZE_OVER_PREDICTED[0]} "
         "where pictures are predicted, "
-        f"{SIZE_OVER_SINGLE_PARAMETER[0]} where one number varies, as along a path, and "
+        f"{SIZE_OVER_SINGLE_PARAMETER[0]} where one number varies, as along a path, "
+        "and "
         f"{SIZE_OVER_RENDERED[0]} where they are rendered",
         ge=1,
         le=1_000_000,
@@ -287,7 +289,8 @@ class AttackConfig(DerivativeConfig):
         None,
         "search",
         "how many random conditions each step looks at, with --over",
-        otherwise=f"{SIZE_OVER_PREDICTED[1]} where pictures are predicted and more than one "
+        otherwise=f"{SIZE_OVER_PREDICTED[1]} where pictures are predicted and more "
+        "than one "
         "number varies, otherwise "
         f"{SIZE_OVER_RENDERED[1]}",
         ge=1,

@@ -540,8 +540,8 @@ def _replace_if_random_is_worse(
         )
 
 
-# trials in a row that the upper end of a smallest epsilon has to pass, in as many checks
-# as have them
+# trials in a row that the upper end of a smallest epsilon has to pass, in as many
+# checks as have them
 MIN_CONFIRMING_TRIALS = 40
 
 

@@ -217,7 +217,8 @@ class GradientCheck:
             yield part.make_row(row)
 
     def _measure_model(self, part: CheckedPart, title: str) -> Iterator[Finding]:
-        """Plan a search by the model's own loss, and measure its derivatives as planned.
+        """Plan a search by the model's own loss, and measure its derivatives as
+        planned.
 
         Args:
             part: what is measured.

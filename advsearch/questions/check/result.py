@@ -87,7 +87,9 @@ class CheckConfig(DerivativeConfig):
 
 
 class CheckedRow(results.Measured):
-    """A derivative along a parameter, or the gradient of a control, and its reference."""
+    """A derivative along a parameter, or the gradient of a control, and its
+    reference.
+    """
 
     object: str
     environment: str
@@ -134,7 +136,9 @@ class SearchPlan(results.PlannedGradient):
 
 
 class CheckResult(views.InNotebook, RunResult):
-    """Every derivative of a scene, compared with differences, and the plan of a search."""
+    """Every derivative of a scene, compared with differences, and the plan of a
+    search.
+    """
 
     command: ClassVar[str] = "check"
 

@@ -46,7 +46,9 @@ STORED_SWEEP_SETTINGS = (
 
 
 class CompareConfig(SweepConfig):
-    """Settings of `compare`: the stored sweeps that it reads, or the sweep that it runs."""
+    """Settings of `compare`: the stored sweeps that it reads, or the sweep that it
+    runs.
+    """
 
     command: ClassVar[str] = "compare"
     without: ClassVar[tuple[str, ...]] = (
@@ -103,7 +105,9 @@ class CompareConfig(SweepConfig):
 
     @model_validator(mode="after")
     def _check_settings(self) -> CompareConfig:
-        """Reject settings of a sweep where stored ones are compared, and a single model."""
+        """Reject settings of a sweep where stored ones are compared, and a single
+        model.
+        """
         if not self.object:
             for declared in settings.settings(type(self)):
                 if (

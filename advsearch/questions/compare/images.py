@@ -45,7 +45,8 @@ class PairImages:
     def list_examples(
         self, first: Side, second: Side, pair: int
     ) -> Iterator[PairPicture]:
-        """Yield pairs that only one side gets right, those with the largest margin gap first.
+        """Yield pairs that only one side gets right, those with the largest margin gap
+        first.
 
         There are at most as many of each side as the settings say, with images as far
         as these are available; `pair` is the number of the two sides.
@@ -110,7 +111,9 @@ class PairImages:
             self.context.progress.advance(1)
 
     def _render_image(self, image: MissingImage) -> None:
-        """Render an image again; add a warning if its scene or model is not available."""
+        """Render an image again; add a warning if its scene or model is not
+        available.
+        """
         sweep = image.side.sweep
         if str(sweep.folder) in self._unavailable:
             return

@@ -114,7 +114,9 @@ def count_pairs(
 def split_by_value(
     column: pd.Series, edges: Sequence[float] | None
 ) -> Iterator[tuple[Any, BoolArray]]:
-    """Yield each value of a parameter, or part of its range, and the mask (n,) of its rows."""
+    """Yield each value of a parameter, or part of its range, and the mask (n,) of its
+    rows.
+    """
     if column.dtype == "category":
         for name in column.cat.categories:
             yield name, np.asarray(column == name)

@@ -91,7 +91,9 @@ class PairRule(CountOf):
 
 
 class PairPart(PairCounts):
-    """Counts of the pairs with one value of a parameter, or in one part of its range."""
+    """Counts of the pairs with one value of a parameter, or in one part of its
+    range.
+    """
 
     parameter: str
     unit: str
@@ -180,12 +182,14 @@ P_VALUE_NOTE = (
     "where both are right equally often "
 )
 MCNEMAR_NOTE = (
-    f"{P_VALUE_NOTE}(exact McNemar test, two-sided). Intervals of differences are Newcombe's "
+    f"{P_VALUE_NOTE}(exact McNemar test, two-sided). Intervals of differences are "
+    "Newcombe's "
     "for pairs, of shares "
     "Clopper-Pearson's, each for its row by itself."
 )
 UNITS_NOTE = (
-    f"{P_VALUE_NOTE}(at most, two-sided). Frames of one drive are not independent, nor are "
+    f"{P_VALUE_NOTE}(at most, two-sided). Frames of one drive are not independent, nor "
+    "are "
     "pictures of one configuration: p "
     "and intervals are over {units}, by bets, each for its row by itself. All {units} "
     "weigh the same."
@@ -428,7 +432,8 @@ def make_compare_claims(result: CompareResult) -> Iterator[views.Claim]:
     for pair in result.pairs:
         method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
         statement = (
-            f"{summarize_difference(pair)} {describe_exclusive_pairs(pair)} The interval of the "
+            f"{summarize_difference(pair)} {describe_exclusive_pairs(pair)} The "
+            "interval of the "
             f"difference is {method}."
         )
         side = next(side for side in result.sides if side.name == pair.second)

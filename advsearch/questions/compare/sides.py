@@ -239,7 +239,9 @@ def has_same_values(first: pd.Series, second: pd.Series) -> bool:
 
 
 def find_different_settings(sides: Sequence[Side]) -> list[str]:
-    """Return the names of the settings that decide predictions and differ between sides."""
+    """Return the names of the settings that decide predictions and differ between
+    sides.
+    """
     first, *others = (side.sweep.config.get_deciding_settings() for side in sides)
     names = {name for other in others for name in other if other[name] != first[name]}
     names |= {

@@ -161,7 +161,9 @@ def _read_sweeps(config: ExplainConfig) -> list[StoredSweep]:
 def _analyze_rows(
     table: Any, config: ExplainConfig, progress: Any
 ) -> tuple[Any, Any, Any]:
-    """Find rules, the importance of parameters, and the envelope of right predictions."""
+    """Find rules, the importance of parameters, and the envelope of right
+    predictions.
+    """
     from advsearch.extend import rules
     from advsearch.questions.explain.envelope import find_envelope
     from advsearch.questions.explain.importance import find_importance
@@ -214,7 +216,9 @@ def read_table(sweeps: Sequence[StoredSweep]) -> tuple[pd.DataFrame, pd.DataFram
 
 
 def find_sweeps(path: Path) -> list[Path]:
-    """Return the directories of the sweeps of a run: its own, or those of a recipe's parts."""
+    """Return the directories of the sweeps of a run: its own, or those of a recipe's
+    parts.
+    """
     result = read_result(path)
     if result.command != "recipe":
         return [path]

@@ -69,7 +69,9 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
 
 
 def _is_clearer_than_noise(seed: int, points: FloatArray, silhouette: float) -> bool:
-    """Return whether points have a higher silhouette than each reference of random points."""
+    """Return whether points have a higher silhouette than each reference of random
+    points.
+    """
     generator = np.random.default_rng(seed)
     spread = points.std(axis=0)
     references = (
@@ -85,10 +87,12 @@ def sort_by_distance(points: FloatArray, members: IntArray) -> tuple[int, ...]:
 
 
 def cluster_points(points: FloatArray) -> tuple[float, IntArray]:
-    """Cluster points (n, d) into the number of clusters with the largest mean silhouette.
+    """Cluster points (n, d) into the number of clusters with the largest mean
+    silhouette.
 
     Returns:
-        The mean silhouette, -1 if none can be computed; and the cluster of each point (n,).
+        The mean silhouette, -1 if none can be computed; and the cluster of each point
+        (n,).
     """
     k_means = rules.import_library("sklearn.cluster").KMeans
     compute_silhouette = rules.import_library("sklearn.metrics").silhouette_score

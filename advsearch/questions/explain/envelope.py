@@ -23,7 +23,9 @@ PEELED_FRACTION = 0.05
 MIN_BOX_UNITS = 60
 """Fewer rows, or drives, than this cannot show an accuracy of 95 %."""
 ACCURACY_RESERVE = 0.01
-"""Additional accuracy of the choosing rows, which are biased since they chose the box."""
+"""Additional accuracy of the choosing rows, which are biased since they chose the
+box.
+"""
 
 
 def find_envelope(

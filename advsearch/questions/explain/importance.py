@@ -49,7 +49,8 @@ IntArray = npt.NDArray[np.int64]
 
 
 def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
-    """Estimate how much each factor, and each interacting pair, decides the predictions.
+    """Estimate how much each factor, and each interacting pair, decides the
+    predictions.
 
     Returns:
         The factors by falling share, without what chance adds to it; then the pairs,
@@ -133,7 +134,9 @@ class ClusteredPredictions:
         self.variance = self.mean * (1.0 - self.mean)
 
     def explained_fraction(self, group: IntArray) -> tuple[float, int]:
-        """Return the fraction of the variance between groups, and the number of used groups."""
+        """Return the fraction of the variance between groups, and the number of used
+        groups.
+        """
         group_weight = np.bincount(group, self.weight)
         is_used = group_weight > 0
         used_weight = group_weight[is_used]
@@ -228,12 +231,15 @@ class ClusteredPredictions:
         group_weight: npt.NDArray[Any],
         is_used: npt.NDArray[np.bool_],
     ) -> FloatArray:
-        """Return the weighted difference (n,) of each prediction from the rate of its group."""
+        """Return the weighted difference (n,) of each prediction from the rate of its
+        group.
+        """
         n_correct = np.bincount(group, self.weight * self.correct)
         group_rate = np.divide(
             n_correct, group_weight, out=np.zeros(len(group_weight)), where=is_used
         )
-        return self.weight * (self.correct - group_rate[group])
+        residual: FloatArray = self.weight * (self.correct - group_rate[group])
+        return residual
 
     def _between_cluster_variance(
         self, cell_cluster: IntArray, cell_residual: npt.NDArray[Any]

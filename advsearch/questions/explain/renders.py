@@ -204,7 +204,9 @@ class Renders:
                     break
 
     def _relative_change(self, pair: NearestRight) -> float:
-        """Return the difference of a pair as a fraction of the factor's range; 1 for names."""
+        """Return the difference of a pair as a fraction of the factor's range; 1 for
+        names.
+        """
         column = self.table[pair.parameter]
         if column.dtype == "category":
             return 1.0
@@ -262,13 +264,16 @@ class Renders:
         right_indices = np.flatnonzero(is_right).tolist()
         if self.table[factor].dtype == "category":
             return int(right_indices[0])
-        return min(
+        nearest_index: int = min(
             right_indices,
             key=lambda index: abs(float(values[index]) - float(wrong_value)),
         )
+        return nearest_index
 
     def _list_thumbnails(self, name: str, numbers: Sequence[int]) -> list[str]:
-        """Return the stored images of a part, as paths relative to the run directory."""
+        """Return the stored images of a part, as paths relative to the run
+        directory.
+        """
         sweep = self._rendered.get(name)
         if sweep is None:
             return []
@@ -283,7 +288,9 @@ class Renders:
     # ------------------------------------------------------------------------------
 
     def find_clusters(self) -> FailureClusters | None:
-        """Render failures of one model again, and cluster them by the model's features."""
+        """Render failures of one model again, and cluster them by the model's
+        features.
+        """
         selected = self._select_sweeps()
         failing = self.rows[~self.rows["correct"] & self.rows["sweep"].isin(selected)]
         if self.interrupted or not self.config.clusters or failing.empty:
@@ -343,7 +350,9 @@ class Renders:
     def _describe_cluster(
         self, number: int, rows: pd.DataFrame, image: torch.Tensor
     ) -> FailureCluster:
-        """Describe a cluster by its rows, and store its most typical image (H, W, 3)."""
+        """Describe a cluster by its rows, and store its most typical image (H, W,
+        3).
+        """
         path = self.context.run.save_image(f"cluster-{number}", image)
         return FailureCluster(
             failures=len(rows),
@@ -353,7 +362,9 @@ class Renders:
         )
 
     def _select_sweeps(self) -> list[int]:
-        """Return the indices of the sweeps of the first model that was swept by itself."""
+        """Return the indices of the sweeps of the first model that was swept by
+        itself.
+        """
         models = next(
             (
                 sweep.config.models
@@ -374,7 +385,8 @@ class Renders:
         """Render images of a sweep of one model again.
 
         Returns:
-            The images (n, H, W, 3) as the model sees them, and what computes its features.
+            The images (n, H, W, 3) as the model sees them, and what computes its
+            features.
 
         Raises:
             InputError: the scene is no longer available, or the task is another than

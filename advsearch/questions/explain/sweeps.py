@@ -196,7 +196,9 @@ def make_sweep_along(
 def select_choices(
     config: SweepConfig, grid: Mapping[str, object]
 ) -> dict[str, dict[str, Any]]:
-    """Return the controls whose choices matter though a grid sets all of their parameters."""
+    """Return the controls whose choices matter though a grid sets all of their
+    parameters.
+    """
     controls = {}
     for instance, options in config.controls.items():
         control_type = config.find_control_type(instance)
@@ -226,7 +228,9 @@ def is_sampled(config: SweepConfig, factor: str) -> bool:
 
 
 def is_settable(config: SweepConfig, name: str) -> bool:
-    """Return whether a value of a row can be set; others follow, as `path.distance` does."""
+    """Return whether a value of a row can be set; others follow, as `path.distance`
+    does.
+    """
     instance, dot, parameter = name.partition(".")
     declared = config.declared_parameters(instance)
     return not dot or declared is None or parameter in declared

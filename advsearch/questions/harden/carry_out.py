@@ -195,10 +195,10 @@ class Hardening:
     """A run that measures a model, trains it, and measures it again.
 
     Attributes:
-        is_wrong: whether a search found a wrong prediction, by the kind of the row, which
-            is a measurement and a control, and the number of the scene.
-        clean_is_right: whether each plain image of a held-out scene is right, "before" and
-            "after".
+        is_wrong: whether a search found a wrong prediction, by the kind of the row,
+            which is a measurement and a control, and the number of the scene.
+        clean_is_right: whether each plain image of a held-out scene is right, "before"
+            and "after".
         outcomes: counts of what becomes of the object in the others, likewise.
         n_scenes: number of scenes by split.
     """
@@ -451,8 +451,8 @@ def make_share(
     """Return the fraction of right images with its interval over scenes.
 
     Args:
-        is_right: whether each image is right (scenes * views), all views of a scene after
-            each other; None if they are not measured.
+        is_right: whether each image is right (scenes * views), all views of a scene
+            after each other; None if they are not measured.
         views: images of each scene, which are not independent.
         outcomes: counts of what becomes of the object in the others.
     """

@@ -38,7 +38,9 @@ from advsearch.extend import (
 IMAGE_DIRECTORY = "artifacts/pictures"
 """Directory of the training's images in the run."""
 SPP = 2
-"""Samples per pixel of an image; many lessons with noise teach more than few without."""
+"""Samples per pixel of an image; many lessons with noise teach more than few
+without.
+"""
 MATRIX_SPP = 4
 """Samples per pixel of a matrix of light transport."""
 MAX_DEPTH = 4
@@ -163,8 +165,9 @@ def make_lessons(
         seed: root of the samples.
         n_plain: further views without worst images.
         n_tries: random configurations of each view that are rendered where a matrix of
-            light transport does not give the images (see `sample_configurations`). None renders
-            each view twice: with a single control changed, and with all of them.
+            light transport does not give the images (see `sample_configurations`). None
+            renders each view twice: with a single control changed, and with all of
+            them.
         shares_texture: whether the views have one adversarial texture.
     """
     has_matrix = bool(n_views) and problem.is_linear
@@ -378,7 +381,8 @@ def ascend_textures(
 
     Args:
         selected: the lessons.
-        gradients_of: returns the gradient of each lesson, as `compute_texture_gradients` does.
+        gradients_of: returns the gradient of each lesson, as
+            `compute_texture_gradients` does.
         steps: number of steps.
     """
     texture_lessons = [
@@ -430,11 +434,11 @@ def save_lesson_images(
 ) -> None:
     """Write the images of a round's lessons, and those of all rounds as a WebDataset.
 
-    The images are ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png`` in `IMAGE_DIRECTORY`
-    of the run. The WebDataset is next to that directory. It has a ``.png`` of each
-    image, a ``.cls`` with the index of its class, and a ``.json`` with that and the
-    kind of image. Members have no time and no owner, so that equal images make equal
-    files.
+    The images are ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png`` in
+    `IMAGE_DIRECTORY` of the run. The WebDataset is next to that directory. It has a
+    ``.png`` of each image, a ``.cls`` with the index of its class, and a ``.json`` with
+    that and the kind of image. Members have no time and no owner, so that equal images
+    make equal files.
     """
     for index, lesson in enumerate(selected):
         label = re.sub(
@@ -450,7 +454,9 @@ def save_lesson_images(
 
 
 def _write_webdataset(directory: Path) -> None:
-    """Write the images of a directory into a tar beside it; see `save_lesson_images`."""
+    """Write the images of a directory into a tar beside it; see
+    `save_lesson_images`.
+    """
     with (
         writing.replacing(directory.with_suffix(".tar")) as temporary_path,
         tarfile.open(temporary_path, "w") as tar,

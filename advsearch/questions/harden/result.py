@@ -31,7 +31,9 @@ With few of them the training generalizes worse to other scenes, and loses clean
 accuracy.
 """
 RENDERED_SCENES = 15
-"""The same where controls are rendered: the view is rendered at random configurations."""
+"""The same where controls are rendered: the view is rendered at random
+configurations.
+"""
 
 TEXTURE_USES_PER_EPOCH = 6
 """How often an epoch uses a scene with a texture, over its views.
@@ -51,7 +53,9 @@ QUICK: dict[str, int] = {
 
 
 class HardenConfig(AttackConfig):
-    """Settings of `harden`: training on worst cases, and measurement before and after."""
+    """Settings of `harden`: training on worst cases, and measurement before and
+    after.
+    """
 
     # fmt: off
     command: ClassVar[str] = "harden"
@@ -275,7 +279,8 @@ class HardenResult(views.InNotebook, RunResult):
 ROBUST_NOTE = (
     "Robust: the plain picture of a held-out scene is right, and the search finds no "
     "wrong one. 95 % intervals over scenes: Clopper-Pearson; of plain pictures, two of "
-    "each scene, by bets. Scenes are of the objects that are named: intervals and p say "
+    "each scene, by bets. Scenes are of the objects that are named: intervals and p "
+    "say "
     "nothing of other objects."
 )
 TRAINING_NOTE = (

@@ -62,12 +62,13 @@ class Trainer(ABC):
         optimiser: creates the optimizer of the parameters, with a learning rate of its
             own; None for AdamW.
         custom_items: items that are trained on along with the sampled ones.
-        n_further_scenes: scenes that are sampled in addition to each one of the training.
+        n_further_scenes: scenes that are sampled in addition to each one of the
+            training.
         n_views: number of views of a training scene, and of a validation scene.
         batch_size: items of a step.
         warm_up_fraction: fraction of the steps in which the learning rate rises.
-        average_decay: decay per step of the running average of the weights, which a round
-            ends with.
+        average_decay: decay per step of the running average of the weights, which a
+            round ends with.
     """
 
     batch_size: ClassVar[int]
@@ -179,7 +180,9 @@ class Trainer(ABC):
     def _update_average(
         self, n_steps: int, average: Sequence[Tensor], parameters: Sequence[Tensor]
     ) -> None:
-        """Move the running average of the parameters towards their values after a step."""
+        """Move the running average of the parameters towards their values after a
+        step.
+        """
         decay = min(self.average_decay, n_steps / (n_steps + 5))
         for mean, parameter in zip(average, parameters, strict=True):
             mean.lerp_(parameter.detach(), 1.0 - decay)
@@ -224,7 +227,8 @@ class Rounds:
     """The rounds of a run.
 
     Attributes:
-        results: the result of each round that has ended; the first is the original model.
+        results: the result of each round that has ended; the first is the original
+            model.
     """
 
     def __init__(self, run: RunDirectory, trainer: Trainer) -> None:
@@ -247,7 +251,9 @@ class Rounds:
 
     @property
     def best(self) -> int:
-        """The most robust round whose clean accuracy has fallen by no more than allowed."""
+        """The most robust round whose clean accuracy has fallen by no more than
+        allowed.
+        """
         allowed = [
             number
             for number, training_round in enumerate(self.results)
@@ -309,7 +315,8 @@ class Rounds:
         self.write_weights(WEIGHTS_FILE)
 
     def select_interpolation(self, held_back: Sequence[Any]) -> tuple[Score, float]:
-        """Set the student to the best interpolation between original and trained weights.
+        """Set the student to the best interpolation between original and trained
+        weights.
 
         The best one is right most often on the worst images among those whose clean
         accuracy has fallen by no more than allowed; if all have fallen more, it is the

@@ -408,14 +408,18 @@ def _load_evaluators(run: Path) -> list[_PhotoEvaluator]:
 
 
 def _load_sweep_evaluators(config: SweepConfig) -> list[_PhotoEvaluator]:
-    """Load the models of a sweep, and find ground truth by the numbers of its images."""
+    """Load the models of a sweep, and find ground truth by the numbers of its
+    images.
+    """
     scenes = workbench.load_scenes_of_sweep(config)
     job = scenes.job
 
     def find_truth(
         model_index: int, rendering: str | None, object_name: str | None
     ) -> workbench.Truth:
-        """Return the ground truth of an image of the sweep, or of the object in view."""
+        """Return the ground truth of an image of the sweep, or of the object in
+        view.
+        """
         task = job.tasks[model_index]
         if rendering is None or not _needs_position(task):
             matching = [
@@ -443,7 +447,9 @@ def _load_sweep_evaluators(config: SweepConfig) -> list[_PhotoEvaluator]:
 
 
 def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvaluator]:
-    """Load the models of an attack, and find ground truth by the names of its images."""
+    """Load the models of an attack, and find ground truth by the names of its
+    images.
+    """
     problem, _ = workbench.problem_from_config(workbench.with_evaluation_only(config))
 
     def find_truth(task: Task, rendering: str | None, _: str | None) -> workbench.Truth:

@@ -22,7 +22,9 @@ from advsearch.questions.photographs.result import (
 )
 
 KEY = "X-Advsearch-Key"
-"""Header with which this server's page sends a photograph; no other page can send it."""
+"""Header with which this server's page sends a photograph; no other page can send
+it.
+"""
 
 
 class PhotographPages:
@@ -50,7 +52,9 @@ class PhotographPages:
     def make_page(
         self, run: Path, name: str, key: str, other_device_url: str | None
     ) -> str:
-        """Return the page of a run's photographs; arguments as for `make_align_page`."""
+        """Return the page of a run's photographs; arguments as for
+        `make_align_page`.
+        """
         return make_align_page(
             name,
             list_renderings(run),

@@ -2,10 +2,10 @@
 
 A rendering is named as its file is: a sweep's by the number of its picture, an attack's
 ``adversarial``, ``clean`` or ``verification-00``. A photograph comes from a browser, so
-it is not trusted: its size is checked before it is decoded, it is cut to the rendering's
-shape, and written again without metadata (coordinates, names of cameras). The
-page lays a rendering, translucent or its edges, over the camera's picture, after the
-phone app of 3DB (Leclerc et al. 2021, appendix D).
+it is not trusted: its size is checked before it is decoded, it is cut to the
+rendering's shape, and written again without metadata (coordinates, names of cameras).
+The page lays a rendering, translucent or its edges, over the camera's picture, after
+the phone app of 3DB (Leclerc et al. 2021, appendix D).
 """
 
 from __future__ import annotations
@@ -52,7 +52,9 @@ class PhotographedRendering(results.Fields):
 
 
 class PhotoAgreement(results.Fields):
-    """Counts of photographs by whether a model is right in them and in the rendering."""
+    """Counts of photographs by whether a model is right in them and in the
+    rendering.
+    """
 
     photos: int
     right_right: int = Field(

@@ -59,7 +59,9 @@ class TimeBudget:
 
 @dataclass
 class MeasuredRounds:
-    """Measurements by setting, the seconds of each call, and settings that did not fit."""
+    """Measurements by setting, the seconds of each call, and settings that did not
+    fit.
+    """
 
     results: dict[SampleSetting, list[Any]] = field(default_factory=dict)
     wall_seconds: dict[SampleSetting, list[float]] = field(default_factory=dict)
@@ -86,10 +88,11 @@ class MeasuredRounds:
     def estimate_needed_seconds(
         self, setting: SampleSetting, seconds_left: float
     ) -> float:
-        """Estimate the seconds for `MIN_CALLS` calls of a new setting and of earlier ones.
+        """Estimate the seconds for `MIN_CALLS` calls of a new setting and of earlier
+        ones.
 
-        An earlier setting that needs more than a fraction `MAX_SETTING_FRACTION` of the remaining
-        time turned out too expensive, and waits until the end.
+        An earlier setting that needs more than a fraction `MAX_SETTING_FRACTION` of the
+        remaining time turned out too expensive, and waits until the end.
         """
         cold_seconds = list[float]()
         earlier_seconds = 0.0
@@ -116,8 +119,8 @@ def measure_in_rounds(
 ) -> MeasuredRounds:
     """Measure settings in rounds, cheapest first, until the budget is used up.
 
-    In the first round a setting is started only if `MIN_CALLS` calls of it, and those that
-    the settings before it still need for as many, fit into the remaining time; the
+    In the first round a setting is started only if `MIN_CALLS` calls of it, and those
+    that the settings before it still need for as many, fit into the remaining time; the
     first is always measured. The first call compiles and records kernels, so that every
     setting has two at once: without the second, nothing would be known of its time. A
     call that should not fit is not started: a budget is kept to within a setting's
@@ -203,7 +206,9 @@ def choose_part_samples(
 
 
 def measure_time(take: Callable[[], Part]) -> tuple[Part, dict[str, float]]:
-    """Call a function; return its result, and seconds of processor and wall clock time."""
+    """Call a function; return its result, and seconds of processor and wall clock
+    time.
+    """
     process_start = time.process_time()
     wall_start = time.perf_counter()
     result = take()
@@ -232,7 +237,8 @@ OTHER_LINES_COST = 6.0
 
 
 class PictureBench:
-    """Measures the error of pictures of one configuration (d,), and of the model's margin.
+    """Measures the error of pictures of one configuration (d,), and of the model's
+    margin.
 
     Every sampler is measured, some with a denoiser too. Pictures with and without
     denoiser have the same reference, margins their own.
@@ -381,7 +387,9 @@ class GradientPart:
         )
 
     def count_renders(self, estimator: str) -> int:
-        """Return the primal renders of a gradient by an estimator, without the image itself."""
+        """Return the primal renders of a gradient by an estimator, without the image
+        itself.
+        """
         return sum(replace(group, estimator=estimator).renders for group in self.groups)
 
 
@@ -415,7 +423,8 @@ def list_gradient_parts(
 
 
 class GradientBench:
-    """Measures the error of the gradient (n,) of one part of a space at u, by every estimator.
+    """Measures the error of the gradient (n,) of one part of a space at u, by every
+    estimator.
 
     The reference has a better sampler: differences at two steps for few coordinates,
     else the mean of an adjoint.
@@ -522,7 +531,9 @@ class GradientBench:
         return self.reference.error if self.reference else 0.0
 
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
-        """Compute a gradient; return its errors, and times including the picture itself."""
+        """Compute a gradient; return its errors, and times including the picture
+        itself.
+        """
         assert self.reference is not None
         gradient, times = measure_time(
             partial(

@@ -59,7 +59,8 @@ REFERENCE_FRACTION = 0.35
 CONFIRM_FRACTION = 0.4
 MIN_CONFIRMATIONS = 4
 MAX_CONFIRMATIONS = 64
-"""Fraction of a gradient's time to measure the recommended setting again, and how often.
+"""Fraction of a gradient's time to measure the recommended setting again, and how
+often.
 
 It counts from `MIN_CONFIRMATIONS` measurements on.
 """
@@ -363,7 +364,9 @@ def _describe_skipped(title: str, measured: Any) -> list[str]:
 def group_by_line(
     points: Sequence[PrecisionPoint],
 ) -> dict[tuple[str, ...], list[PrecisionPoint]]:
-    """Group points by quantity, control, family and estimator, in ascending order of samples."""
+    """Group points by quantity, control, family and estimator, in ascending order of
+    samples.
+    """
     lines: dict[tuple[str, ...], list[PrecisionPoint]] = {}
     for point in points:
         lines.setdefault(

@@ -28,7 +28,9 @@ SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler
 
 
 class PrecisionConfig(DerivativeConfig):
-    """Settings of `precision`: error against run time, of a scene, its controls and a model."""
+    """Settings of `precision`: error against run time, of a scene, its controls and a
+    model.
+    """
 
     command: ClassVar[str] = "precision"
     clashes: ClassVar[tuple[settings.Clash, ...]] = (
@@ -138,7 +140,9 @@ class PrecisionPoint(results.Measured):
 
     @property
     def is_known(self) -> bool:
-        """Whether the error is well above the reference's own; else it is an upper limit."""
+        """Whether the error is well above the reference's own; else it is an upper
+        limit.
+        """
         return self.status == "ok"
 
     @property
@@ -148,7 +152,9 @@ class PrecisionPoint(results.Measured):
 
 
 class PrecisionSlope(results.Fields):
-    """A line through the points of an estimator: log of the error against log of the samples."""
+    """A line through the points of an estimator: log of the error against log of the
+    samples.
+    """
 
     quantity: str
     control: str
@@ -193,7 +199,9 @@ class Recommended(results.Fields):
 
 
 class Sitting(results.Fields):
-    """What was measured without a break: the picture and the margin, or a control's gradient."""
+    """What was measured without a break: the picture and the margin, or a control's
+    gradient.
+    """
 
     points: list[PrecisionPoint] = Field(default=[])
     references: list[PrecisionReference] = Field(default=[])

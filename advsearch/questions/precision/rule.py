@@ -40,9 +40,10 @@ MIN_TAIL_SIZE = 1000
 MIN_ERROR_PIXELS = 100
 """Limits of heavy tails.
 
-For values of at least `MIN_TAIL_SIZE` numbers it is checked how many of them hold the error. If
-these are fewer than `MIN_ERROR_PIXELS`, in all measurements together, a few noisy pixels
-decide it, and an interval would cover the truth too rarely (`benchmarks/precision.py
+For values of at least `MIN_TAIL_SIZE` numbers it is checked how many of them hold the
+error. If these are fewer than `MIN_ERROR_PIXELS`, in all measurements together, a few
+noisy pixels decide it, and an interval would cover the truth too rarely
+(`benchmarks/precision.py
 --intervals`).
 """
 # difference from theory that a slope may have, whatever its interval
@@ -90,10 +91,10 @@ class ReferenceValue:
         """Compare a value (n,) with the reference.
 
         Returns:
-            `error`, the norm of the difference divided by that of the reference; `cosine`
-            of the angle between them; `fourth`, the sum of fourth powers of the relative
-            errors of the single numbers. NaN if a norm is zero, and `fourth` also if there
-            are too few numbers to tell tails.
+            `error`, the norm of the difference divided by that of the reference;
+            `cosine` of the angle between them; `fourth`, the sum of fourth powers of
+            the relative errors of the single numbers. NaN if a norm is zero, and
+            `fourth` also if there are too few numbers to tell tails.
         """
         difference = value - self.value
         norm = float(np.linalg.norm(value)) * self.norm
@@ -157,11 +158,11 @@ def summarize_samples(
 ) -> PrecisionPoint:
     """Estimate the error of a setting from its measurements.
 
-    The noise of the samples and that of the reference (`reference_error`) are independent, so
-    that their squares add: error^2 = mean of squares - floor^2. A root mean square
-    below `MIN_ERROR_RATIO` times the floor is not known; the result is then a limit. The interval
-    comes from the scatter of the squares on a logarithmic scale; a single measurement
-    and heavy tails have none.
+    The noise of the samples and that of the reference (`reference_error`) are
+    independent, so that their squares add: error^2 = mean of squares - floor^2. A root
+    mean square below `MIN_ERROR_RATIO` times the floor is not known; the result is then
+    a limit. The interval comes from the scatter of the squares on a logarithmic scale;
+    a single measurement and heavy tails have none.
     """
     squares = [numbers["error"] ** 2 for numbers in samples]
     mean_square = statistics.fmean(squares)
@@ -207,7 +208,8 @@ def _interval_factor(deviation: float, mean_square: float, count: int) -> float:
 
 
 def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
-    """Return whether fewer than `MIN_ERROR_PIXELS` pixels hold the error of some pictures.
+    """Return whether fewer than `MIN_ERROR_PIXELS` pixels hold the error of some
+    pictures.
 
     (sum of squares)^2 / (sum of fourth powers) is their number if all of them were
     equal. False if the pictures are too small to tell. What happens in none of the
@@ -236,8 +238,9 @@ def fit_line(
     """Fit the line of log error against log samples by least squares.
 
     Only points with a known error count: one below the reference's own error says
-    nothing. None if fewer than `MIN_FIT_POINTS` are left. Theory says `MONTE_CARLO_SLOPE`,
-    `or_steeper`, or nothing (None). A slope disagrees if its interval excludes theory
+    nothing. None if fewer than `MIN_FIT_POINTS` are left. Theory says
+    `MONTE_CARLO_SLOPE`, `or_steeper`, or nothing (None). A slope disagrees if its
+    interval excludes theory
     *and* it differs by more than `SLOPE_TOLERANCE`.
     """
     known = [point for point in points if point.is_known]
@@ -278,7 +281,9 @@ def fit_line(
 def describe_disagreement(
     slope: PrecisionSlope, points: Sequence[PrecisionPoint]
 ) -> str | None:
-    """Describe how a slope disagrees with theory and the likeliest reason; None if it agrees."""
+    """Describe how a slope disagrees with theory and the likeliest reason; None if it
+    agrees.
+    """
     if slope.agrees is not False or slope.theory is None:
         return None
     if slope.slope <= slope.theory:
@@ -297,7 +302,8 @@ def describe_disagreement(
 
 
 def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
-    """Return whether the last step between known points is much flatter than the first ones.
+    """Return whether the last step between known points is much flatter than the first
+    ones.
 
     That is less than half as steep.
     """
@@ -328,9 +334,9 @@ def recommend_count(
     If the fitted line passes through the interval of every known point, of at least
     four, it stands for them. Otherwise the error is interpolated between points on
     logarithmic axes. Beyond the last one it follows the fitted slope, or that of theory
-    (see `fit_line`) if points are too few for a fit, at most `MAX_EXTRAPOLATION` times as far,
-    and not at all if the line levels off. A limit counts as an error of that size. Time
-    is interpolated, and beyond the last point grows with the samples.
+    (see `fit_line`) if points are too few for a fit, at most `MAX_EXTRAPOLATION` times
+    as far, and not at all if the line levels off. A limit counts as an error of that
+    size. Time is interpolated, and beyond the last point grows with the samples.
     """
     if not points or not goal > 0.0:
         return None
@@ -369,7 +375,9 @@ def _error_on_line(line: PrecisionSlope, spp: float) -> float:
 
 
 def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) -> bool:
-    """Return whether a falling line passes through the interval of every known point."""
+    """Return whether a falling line passes through the interval of every known
+    point.
+    """
     if line.points <= MIN_FIT_POINTS or not line.slope <= -0.1:
         return False
     for point in ordered:
@@ -407,8 +415,8 @@ def confirm_recommendation(
     What looks cheapest among noisy points is mostly a lucky one, and its error looks
     smaller than it is. New measurements, with seeds of their own, don't have that bias.
     If their error is above the goal, the sample count grows as independent samples need
-    it, by (error / goal)^2, at most `MAX_EXTRAPOLATION` times, and the error shrinks by the
-    root.
+    it, by (error / goal)^2, at most `MAX_EXTRAPOLATION` times, and the error shrinks by
+    the root.
     """
     assert recommendation.goal is not None and recommendation.spp is not None
     spp = round_up(
@@ -433,7 +441,9 @@ def _interpolate_count(
     line: PrecisionSlope | None,
     or_steeper: bool | None,
 ) -> tuple[float | None, str]:
-    """Return the samples from which on ordered points stay at or below a goal, and the basis."""
+    """Return the samples from which on ordered points stay at or below a goal, and the
+    basis.
+    """
     last = ordered[-1]
     if last.rms > goal:
         slope = None
@@ -467,7 +477,9 @@ def _interpolate_count(
 def _interpolate_value(
     ordered: Sequence[PrecisionPoint], spp: int, values: Sequence[float], slope: float
 ) -> float:
-    """Interpolate a value at a sample count, on logarithmic axes; beyond, follow a slope."""
+    """Interpolate a value at a sample count, on logarithmic axes; beyond, follow a
+    slope.
+    """
     counts = np.log([float(point.spp) for point in ordered])
     logs = np.log([max(1e-300, value) for value in values])
     beyond = max(0.0, math.log(spp) - counts[-1])

@@ -23,7 +23,8 @@ from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, make_v
     view=make_view,
 )
 def recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
-    """Run a recipe: an experiment of several runs, with figures of them (docs/recipes.md).
+    """Run a recipe: an experiment of several runs, with figures of them
+    (docs/recipes.md).
 
     Args:
         recipe: the name of a bundled recipe, or a YAML file.

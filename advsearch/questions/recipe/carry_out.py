@@ -1,4 +1,6 @@
-"""`recipe`: run an experiment that a YAML file describes, and make figures of its results."""
+"""`recipe`: run an experiment that a YAML file describes, and make figures of its
+results.
+"""
 
 from __future__ import annotations
 
@@ -571,7 +573,8 @@ def read_figure_options(
         return kind, options_type(**values)
     except ValidationError as error:
         raise errors.FileFormatError(
-            f"{where}: figures: {kind}: {format_first_error(error)}; see docs/recipes.md"
+            f"{where}: figures: {kind}: {format_first_error(error)}; see "
+            "docs/recipes.md"
         ) from None
 
 

@@ -73,7 +73,9 @@ class Part(_Described):
 
 
 class Changes(_Described):
-    """Changes that `quick` makes: to settings of all parts, of single parts, parts left out."""
+    """Changes that `quick` makes: to settings of all parts, of single parts, parts left
+    out.
+    """
 
     settings: Settings = Field(default_factory=dict)
     parts: dict[str, Settings] = Field(default_factory=dict)
@@ -226,7 +228,8 @@ def parse_recipe(data: Mapping[str, object], where: str) -> Recipe:
         return Recipe(**values)
     except ValidationError as error:
         raise errors.FileFormatError(
-            f"{where}: {format_first_error(error)}; advsearch show recipe backgrounds prints one"
+            f"{where}: {format_first_error(error)}; advsearch show recipe backgrounds "
+            "prints one"
         ) from None
     except (RecursionError, TypeError) as error:
         raise errors.FileFormatError(
@@ -244,7 +247,9 @@ def format_first_error(error: ValidationError) -> str:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run of a recipe; `around` is the directory of the run whose result it samples around."""
+    """A run of a recipe; `around` is the directory of the run whose result it samples
+    around.
+    """
 
     name: str
     part: str
@@ -346,7 +351,8 @@ def _safe_name(text: str) -> str:
 
 
 def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
-    """Reject a part that would do more than its run, unless the recipe is a bundled one.
+    """Reject a part that would do more than its run, unless the recipe is a bundled
+    one.
 
     That is to connect to other machines, or to start more processes than there are
     cores.

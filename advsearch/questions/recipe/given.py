@@ -31,7 +31,9 @@ PredictionCount = tuple[ClusteredFraction, int]
 
 
 class PredictionsOptions(Options):
-    """Options of the most frequent predictions: by which column, and how many of them."""
+    """Options of the most frequent predictions: by which column, and how many of
+    them.
+    """
 
     by: str
     most: int = Field(default=4, ge=1, le=10)
@@ -82,7 +84,8 @@ def _describe_predictions(
         tally, n_right = counts[0]
         if 2 * n_right < tally.n_counted:
             sentences.append(
-                f"For {value} it is {tally.name}, {tally.describe('given')} and right in "
+                f"For {value} it is {tally.name}, {tally.describe('given')} and right "
+                "in "
                 f"{n_right} of these."
             )
     n_mostly_right = len(groups) - len(sentences)
@@ -154,7 +157,9 @@ MIN_PAIRS = 4
 
 
 class CuesOptions(Options):
-    """Options of cues: columns of texture and shape, and the classes that name a texture."""
+    """Options of cues: columns of texture and shape, and the classes that name a
+    texture.
+    """
 
     texture: str = "material.which"
     shape: str = "object"
@@ -313,7 +318,8 @@ def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
     """Describe by how many percentage points the shape predicts better.
 
     Predictions about one pair of object and texture are dependent: the interval is a
-    percentile bootstrap over pairs. `pairs` are counts as `count_predicted` returns them.
+    percentile bootstrap over pairs. `pairs` are counts as `count_predicted` returns
+    them.
     """
     if len(pairs) < MIN_PAIRS:
         return (
@@ -421,7 +427,9 @@ def _split_by_triangle(
     mixtures: npt.NDArray[np.float64],
     corners: Mapping[Any, Any],
 ) -> list[npt.NDArray[np.bool_]]:
-    """Return which mixtures lie in each triangle of the diagram: a mask (n,) for each."""
+    """Return which mixtures lie in each triangle of the diagram: a mask (n,) for
+    each.
+    """
     triangles = pd.Series(
         [find_triangle(mixture, options.side) for mixture in mixtures]
     )

@@ -188,7 +188,8 @@ class ClusteredFraction:
 
     A unit is what rows share that are not independent, such as a draw of a seed.
     `unit_counts` (n,) of its `unit_sizes` (n,) rows are counted in each unit; in all,
-    `n_counted` of `total`. `fraction` is the mean over units of their fraction, None without rows.
+    `n_counted` of `total`. `fraction` is the mean over units of their fraction, None
+    without rows.
     """
 
     def __init__(
@@ -205,7 +206,9 @@ class ClusteredFraction:
 
     @classmethod
     def from_rows(cls, name: str, rows: Rows, flags: Any = None) -> ClusteredFraction:
-        """Count rows by unit: those that are flagged (n,), by default the correct ones."""
+        """Count rows by unit: those that are flagged (n,), by default the correct
+        ones.
+        """
         if flags is None:
             flags = rows["correct"]
         is_counted = np.asarray(flags, dtype=np.float64)
@@ -255,7 +258,9 @@ class ClusteredFraction:
         return f"{verb} in {self.n_counted} of {self.total} ({share})"
 
     def is_below(self, other: ClusteredFraction, n_compared: int = 1) -> bool:
-        """Return whether this interval lies below that of another tally, both widened."""
+        """Return whether this interval lies below that of another tally, both
+        widened.
+        """
         lower = self.interval(n_compared)
         upper = other.interval(n_compared)
         return lower is not None and upper is not None and lower[1] < upper[0]
@@ -860,7 +865,9 @@ def _add_agreement(
     table: list[list[Cell]],
     series_name: str,
 ) -> None:
-    """Add the agreement of pairs to the bars and the table, for all objects and each."""
+    """Add the agreement of pairs to the bars and the table, for all objects and
+    each.
+    """
     for name, tallies in bars.items():
         object_pairs = pairs if name == ALL_OBJECTS else pairs[pairs["object"] == name]
         tally, cells = _count_agreement(name, object_pairs)
@@ -939,7 +946,9 @@ def _describe_photographs(n_pairs: int, n_unpaired: int) -> list[str]:
 
 
 def _describe_where(right: bool, pairs: Rows) -> str:
-    """Describe the other image of pairs whose rendering was predicted right or wrong."""
+    """Describe the other image of pairs whose rendering was predicted right or
+    wrong.
+    """
     verb = "right" if right else "wrong"
     selected = pairs[pairs["correct rendered"] == right]
     if selected.empty:
@@ -1033,7 +1042,9 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
 def _draw_scaling(
     figure: Any, rates_by_count: Mapping[int, Any], max_rate: float
 ) -> None:
-    """Draw median and range of the throughput over worker counts, and linear scaling."""
+    """Draw median and range of the throughput over worker counts, and linear
+    scaling.
+    """
     axes = figure.subplots()
     counts = list(rates_by_count)
     fewest, slowest = next(iter(rates_by_count.items()))

@@ -1,4 +1,6 @@
-"""Settings and result of `recipe`: its runs, and its figures with numbers and sentences."""
+"""Settings and result of `recipe`: its runs, and its figures with numbers and
+sentences.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ SCENE_SETTINGS: Any = SceneConfig
 
 
 class RecipeConfig(Config):
-    """Settings of `recipe`: which recipe, and on which objects, environments and models."""
+    """Settings of `recipe`: which recipe, and on which objects, environments and
+    models.
+    """
 
     command: ClassVar[str] = "recipe"
     free: ClassVar[tuple[str, ...]] = (*Config.free, "photographs")

@@ -16,7 +16,9 @@ from advsearch.questions.region.result import (
 
 
 def read_shared_settings(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that come from the run of `around`: scene, model, controls."""
+    """Return the settings that come from the run of `around`: scene, model,
+    controls.
+    """
     return RegionConfig.get_shared_settings(AttackConfig.from_yaml(file))
 
 

@@ -20,13 +20,15 @@ from advsearch.extend import (
 )
 
 MIN_SAMPLES = 8
-"""With fewer samples, not even a box without exceptions has one verdict in more than half
-of it, at the confidence of `questions.region.boxes.GrownBox.interval`.
+"""With fewer samples, not even a box without exceptions has one verdict in more than
+half of it, at the confidence of `questions.region.boxes.GrownBox.interval`.
 """
 
 
 class RegionConfig(SceneConfig):
-    """The settings of `region`: a box around a configuration where the verdict stays."""
+    """The settings of `region`: a box around a configuration where the verdict
+    stays.
+    """
 
     command: ClassVar[str] = "region"
     without: ClassVar[tuple[str, ...]] = ("spp",)

@@ -1,4 +1,5 @@
-"""Render the adversarial scene of a run under conditions that it was not verified under.
+"""Render the adversarial scene of a run under conditions that it was not verified
+under.
 
 A condition changes the samples, the renderer, the tone curve, the file format, the
 camera or the model. The clean scene is rendered under each condition too, so that a
@@ -50,7 +51,9 @@ JPEG_QUALITIES = (90, 75, 50)
 MIN_SIZE = 8
 MAX_SIZE = 4096
 PATH_LENGTHS = (2, 16)
-"""Longest light paths, in segments: direct light only, and many more than a run uses."""
+"""Longest light paths, in segments: direct light only, and many more than a run
+uses.
+"""
 
 SENSORS: dict[str, dict[str, float]] = {
     "a good camera": {"shot": 0.02, "read": 0.005, "mosaic": 1.0},

@@ -33,7 +33,9 @@ from advsearch.extend import (
 )
 
 MAX_RENDER_SECONDS = 300
-"""Time limit of one image, Blender's start included; `stored_files.scaled` adapts it."""
+"""Time limit of one image, Blender's start included; `stored_files.scaled` adapts
+it.
+"""
 POLL_INTERVAL = 0.02
 """Seconds between two checks whether an image is finished."""
 MATT = assets.Material(roughness=1.0, metallic=0.0, specular=0.0)
@@ -268,7 +270,9 @@ class Cycles:
         height: int,
         radiance: np.ndarray | None,
     ) -> dict[str, object]:
-        """Return the settings of the Blender script: image size, camera, lamps and environment."""
+        """Return the settings of the Blender script: image size, camera, lamps and
+        environment.
+        """
         to_world = values.get(
             "camera.to_world",
             torch.from_numpy(geometry.camera_to_world(scene, width / height)),
@@ -345,7 +349,9 @@ def _describe_lamps(
 
 
 def _turn_for_blender(shape: assets.Shape) -> assets.Shape:
-    """Rotate a mesh so that Blender, which imports glTF with -y in front, has our axes."""
+    """Rotate a mesh so that Blender, which imports glTF with -y in front, has our
+    axes.
+    """
     rotation = np.array(
         [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32
     )

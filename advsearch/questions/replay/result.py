@@ -139,7 +139,9 @@ class ReplayRow(results.Fields):
 
 
 class ReplayResult(views.InNotebook, results.SceneResult):
-    """How an adversarial scene fares under other conditions than it was verified under."""
+    """How an adversarial scene fares under other conditions than it was verified
+    under.
+    """
 
     command: ClassVar[str] = "replay"
 

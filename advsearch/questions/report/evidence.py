@@ -1,4 +1,6 @@
-"""Runs as evidence: claims, subject, what varied, how it was measured, what is excluded."""
+"""Runs as evidence: claims, subject, what varied, how it was measured, what is
+excluded.
+"""
 
 from __future__ import annotations
 
@@ -150,7 +152,9 @@ def list_triggering_conditions(result: results.Result) -> list[str]:
 
 
 def evaluate_criterion(criterion: float, interval: results.Interval) -> str:
-    """Return whether an interval is above a criterion (met), below (not met) or open."""
+    """Return whether an interval is above a criterion (met), below (not met) or
+    open.
+    """
     lower, upper = interval
     if lower >= criterion:
         return "met"
@@ -230,7 +234,8 @@ def _criterion_of_claims(
         if "right" in extent.what or "held-out" in extent.what:
             lines.append(
                 f"At least {wording.percent(criterion)}: "
-                f"{evaluate_criterion(criterion, extent.interval)} by {extent.count} of "
+                f"{evaluate_criterion(criterion, extent.interval)} by {extent.count} "
+                "of "
                 f"{extent.total} {extent.what}, 95 % interval "
                 f"{wording.interval_text(extent.interval)}.{remark}"
             )
@@ -468,7 +473,9 @@ def collect_claims(result: results.Result) -> list[views.Claim]:
 
 
 def list_photograph_claims(photos: Any) -> list[views.Claim]:
-    """Return the claim of a table of agreement (`advsearch.photo_agreement`), if not empty."""
+    """Return the claim of a table of agreement (`advsearch.photo_agreement`), if not
+    empty.
+    """
     if not photos.photos or photos.interval is None:
         return []
     agreeing = photos.right_right + photos.wrong_wrong
@@ -987,7 +994,9 @@ def _list_searched(
     result: results.Result,
     sweeps: Sequence[tuple[results.Result, Mapping[str, Any]]],
 ) -> list[str]:
-    """Describe what varied in the claims of a suite, or in the sweeps that were read."""
+    """Describe what varied in the claims of a suite, or in the sweeps that were
+    read.
+    """
     noted = read_noted_settings(folder, result)
     if noted is not None:
         return _searched_by_claims(noted.get(CLAIM_KIND))

@@ -1,4 +1,6 @@
-"""The settings that a run recorded: its own, of its claims, and of the runs that it read."""
+"""The settings that a run recorded: its own, of its claims, and of the runs that it
+read.
+"""
 
 from __future__ import annotations
 
@@ -64,8 +66,8 @@ class RecordedSettings:
     def _is_used(self, name: str, value: object) -> bool:
         """Return whether a setting has an effect.
 
-        A default has none if the command renders nothing, since it names no object, or if
-        it would clash with other settings, as `fps` without a path.
+        A default has none if the command renders nothing, since it names no object, or
+        if it would clash with other settings, as `fps` without a path.
         """
         defaults = self._defaults
         if name in defaults and value != defaults[name]:
@@ -169,7 +171,9 @@ def read_run_settings(folder: Path) -> Mapping[str, Any]:
 
 
 def find_read_sweeps(result: results.Result) -> list[Path]:
-    """Return the directories of the sweeps whose rows a result was made from, if they exist."""
+    """Return the directories of the sweeps whose rows a result was made from, if they
+    exist.
+    """
     return _find_runs(
         [
             *getattr(result, "sweeps", ()),

@@ -1,4 +1,6 @@
-"""What `report --evidence` writes: claims of runs with their context, as a page and text."""
+"""What `report --evidence` writes: claims of runs with their context, as a page and
+text.
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,9 @@ from advsearch.questions.stability.result import (
     view=make_view,
 )
 def stability(context: RunContext[StabilityConfig]) -> StabilityResult:
-    """Run stiff and extreme scenes, and report whether each holds (docs/stability.md)."""
+    """Run stiff and extreme scenes, and report whether each holds
+    (docs/stability.md).
+    """
     from advsearch.questions.stability.scenes import run_cases  # imports torch
 
     return run_cases(context)

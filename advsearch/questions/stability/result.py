@@ -27,7 +27,9 @@ from advsearch.extend import (
 
 
 class StabilityConfig(Config):
-    """Settings of `stability`: which cases it runs, for how long, and where results go."""
+    """Settings of `stability`: which cases it runs, for how long, and where results
+    go.
+    """
 
     command: ClassVar[str] = "stability"
     free: ClassVar[tuple[str, ...]] = (*Config.free, "seconds")
@@ -92,7 +94,9 @@ class Check(results.Fields):
     ok: bool
 
     def __str__(self) -> str:
-        """Describe the number and what was expected: ``mean: 0.2 (expected at least 1)``."""
+        """Describe the number and what was expected: ``mean: 0.2 (expected at least
+        1)``.
+        """
         bounds = []
         if self.least is not None:
             bounds.append(f"at least {self.least:.4g}")
@@ -208,9 +212,12 @@ class Outcome:
 
     Attributes:
         checks: the numbers that decide.
-        finite: whether every picture and gradient was finite, and none had to be made so.
-        relative_error: error of a gradient, or of what the case is about; None without one.
-        ending: status of the case's search, "refused" if its input was rejected, or empty.
+        finite: whether every picture and gradient was finite, and none had to be made
+            so.
+        relative_error: error of a gradient, or of what the case is about; None without
+            one.
+        ending: status of the case's search, "refused" if its input was rejected, or
+            empty.
         measured: further numbers to report.
     """
 

@@ -1,4 +1,6 @@
-"""Small scenes for cases: a picture, its gradient compared with differences, a search."""
+"""Small scenes for cases: a picture, its gradient compared with differences, a
+search.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +84,9 @@ def describe_mug() -> SceneDescription:
 
 
 def make_plain_environment() -> assets.EnvironmentAsset:
-    """Return a sky (16, 32, 3) brighter on one side and above, so that rotation shows."""
+    """Return a sky (16, 32, 3) brighter on one side and above, so that rotation
+    shows.
+    """
     rows, columns = np.mgrid[0:16, 0:32].astype(np.float32)
     azimuthal = 0.6 * np.sin(columns * (2.0 * np.pi / 32.0))
     vertical = 0.8 * np.cos(rows * (np.pi / 16.0))
@@ -136,7 +140,9 @@ def make_checkered_mug() -> assets.ObjectAsset:
 
 
 def make_dark_mug() -> assets.ObjectAsset:
-    """Return the mug in black: only its outline changes in the picture, with little noise."""
+    """Return the mug in black: only its outline changes in the picture, with little
+    noise.
+    """
     return paint_mug(np.full((4, 4), 0.02))
 
 
@@ -221,7 +227,7 @@ def check_scene(
 
 
 def _make_start(
-    u: Sequence[float] | Mapping[int, float] | None, renderer: workbench.Renderer
+    u: Sequence[float] | Mapping[int, float] | None, renderer: gradients.Renderer
 ) -> Tensor:
     """Return the start (d,) with some or all of its values replaced."""
     start: Tensor = renderer.start.clone()
@@ -235,7 +241,7 @@ def _check_derivatives(
     compare: bool,
     seeds: tuple[int, int],
     repeats: int,
-    renderer: workbench.Renderer,
+    renderer: gradients.Renderer,
     start: Tensor,
 ) -> tuple[Any, list[Check]]:
     """Compare the gradient with differences, if requested."""
@@ -251,7 +257,7 @@ def _compare_with_scene(
     controls: ControlSettings,
     other_scene: Mapping[str, object] | None,
     apart: Bounds,
-    renderer: workbench.Renderer,
+    renderer: gradients.Renderer,
     start: Tensor,
 ) -> list[Check]:
     """Compare the image with that of another scene, if there is one."""
@@ -329,7 +335,9 @@ def compare_gradient(
     seeds: tuple[int, int] = (3, 12),
     repeats: int = 24,
 ) -> list[results.Measured]:
-    """Compare the plan's gradient of a linear loss with common-random-number differences."""
+    """Compare the plan's gradient of a linear loss with common-random-number
+    differences.
+    """
     formation = renderer.formation
     bench = gradients.Bench(
         renderer, gradients.make_smooth_loss(formation.resolution), u, seed=1, spp=spp
@@ -411,7 +419,9 @@ def run_search(
     policy: Policy[Any] | None = None,
     **options: Any,
 ) -> workbench.SearchResult:
-    """Search for an image with a loss above 0; `options` are those of `attacks.search`."""
+    """Search for an image with a loss above 0; `options` are those of
+    `attacks.search`.
+    """
     evaluate_all = partial(map, partial(evaluate, renderer, loss, spp))
     policy = policy or workbench.make_policy("pgd")
     options = {"candidates": 0, **options}
@@ -428,7 +438,9 @@ def run_search(
 def make_domain(
     renderer: gradients.Renderer, start: Tensor | None = None
 ) -> policies.Domain:
-    """Return the domain of a search from a configuration, by default the renderer's start."""
+    """Return the domain of a search from a configuration, by default the renderer's
+    start.
+    """
     space: Any = renderer.space  # of controls, since `make_renderer` made it
     start = renderer.start if start is None else start
     return workbench.make_domain(

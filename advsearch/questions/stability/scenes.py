@@ -1,4 +1,6 @@
-"""Cases of scenes: light, surfaces, meshes, positions and views that break naive code."""
+"""Cases of scenes: light, surfaces, meshes, positions and views that break naive
+code.
+"""
 
 from __future__ import annotations
 
@@ -187,8 +189,8 @@ def leave_plateau(low: float, high: float) -> Outcome:
     The way out is a lower exposure.
 
     Args:
-        low, high: range of the exposure, stops. Up to about 4 something in the picture is
-            not white.
+        low, high: range of the exposure, stops. Up to about 4 something in the picture
+            is not white.
     """
     renderer = make_renderer({"camera": {"exposure": [low, high]}})
     start = torch.ones_like(renderer.start)
@@ -736,7 +738,8 @@ for control, name in (
 
 
 def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
-    """Run cases of the suite in order, until all are done, the time is over, or an interrupt.
+    """Run cases of the suite in order, until all are done, the time is over, or an
+    interrupt.
 
     The result of a case is stored at once: a resumed run continues with the next.
     """

@@ -361,7 +361,8 @@ def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
 def _check_count(where: str, count: int) -> None:
     if count > MAX_AXIS_VALUES:
         raise InputError(
-            f"{where}: expected at most {MAX_AXIS_VALUES} values on an axis, got {count}; "
+            f"{where}: expected at most {MAX_AXIS_VALUES} values on an axis, got "
+            f"{count}; "
             "draw the parameter by chance "
             "instead, with `controls` and `samples`"
         )
@@ -427,8 +428,8 @@ class SampledNumber:
         parts: what equal parts of [0, 1] stand for: bounds of a range each, or values
             of a list.
         same_in_all_scenes: whether `parts` are the same in every scene.
-        part_of_share: the part that each of more equal shares of [0, 1] stands for, where
-            values have weights.
+        part_of_share: the part that each of more equal shares of [0, 1] stands for,
+            where values have weights.
     """
 
     name: str
@@ -516,8 +517,8 @@ class Points:
         n_parts: into which tables cut the range of each sampled number.
         sampled_numbers: the sampled numbers that tables show.
         sampled_layout: which numbers are sampled; the same for all scenes.
-        is_sampled: whether anything is sampled: a control may have all its values from the
-            grid, as a path its time.
+        is_sampled: whether anything is sampled: a control may have all its values from
+            the grid, as a path its time.
         units: how rows follow from draws.
     """
 

@@ -159,7 +159,9 @@ def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
 
 
 def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
-    """Draw the accuracy at each value of an axis, with intervals, on matplotlib axes."""
+    """Draw the accuracy at each value of an axis, with intervals, on matplotlib
+    axes.
+    """
     values = [row.value for row in rows]
     # A single draw has no interval.
     intervals = [
@@ -785,8 +787,8 @@ class DetectionDistance:
         lower: lower bound of its interval; None if images do not bound it.
         upper: upper bound, likewise.
         min_images: how many images at a distance any bound takes, if none has as many.
-        loose_counts: (m,) images in which a loose box is on it, which count neither as right
-            nor as missed; empty if that is not known.
+        loose_counts: (m,) images in which a loose box is on it, which count neither as
+            right nor as missed; empty if that is not known.
         image_counts: (m,) images.
         dips: distances at which it is detected less often than beyond them, the nearest
             first.

@@ -474,8 +474,8 @@ def summarize_drives(
         values: (n,).
         worst: selects the worst of them: `min` or `max`.
         bounds: bounds of the values whatever a model predicts, from the plan.
-        drive_of_value: (n,) the drive of each value; values of one differ in noise alone, so
-            that their mean is the drive's. None: each has a drive of its own.
+        drive_of_value: (n,) the drive of each value; values of one differ in noise
+            alone, so that their mean is the drive's. None: each has a drive of its own.
     """
     means = values
     if drive_of_value is not None:

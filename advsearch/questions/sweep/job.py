@@ -277,7 +277,8 @@ class Job:
                 raise InputError(
                     "adversarial_of: the adversarial configuration of "
                     f"{named_scene.arm} has {len(named_scene.u)} "
-                    f"numbers, and {named_scene.object} takes {len(start)}: it is another "
+                    f"numbers, and {named_scene.object} takes {len(start)}: it is "
+                    "another "
                     "object, or it has changed since; "
                     "do the run again"
                 )
@@ -727,7 +728,8 @@ class SceneLoader:
     def load_by_name(self, name: str) -> SweptScene:
         """Load a scene by its number as text.
 
-        That is the name of its problem: see `advsearch.engine.journal.make_worker_call`.
+        That is the name of its problem: see
+        `advsearch.engine.journal.make_worker_call`.
         """
         return self.load(int(name))
 

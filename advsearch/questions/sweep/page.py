@@ -53,8 +53,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_EMBEDDED_BYTES = 3_000_000
-"""Bytes of thumbnails in a page that needs no other file, at most; the worst predictions
-first.
+"""Bytes of thumbnails in a page that needs no other file, at most; the worst
+predictions first.
 """
 # in such a page; more are for `advsearch dashboard`
 MAX_EMBEDDED_ROWS = 200_000
@@ -164,7 +164,9 @@ def make_sweep_page(
 def _describe_runs(
     explored: Sequence[tuple[SweepSource, Path, SweepSummary | None]],
 ) -> tuple[list[JsonObject], list[Html], list[Html]]:
-    """Return the descriptions of runs, the rows that the page embeds, and notes on images."""
+    """Return the descriptions of runs, the rows that the page embeds, and notes on
+    images.
+    """
     descriptions = list[JsonObject]()
     embedded_rows = list[Html]()
     image_notes = list[Html]()

@@ -79,7 +79,8 @@ class Groups:
     Attributes:
         group_size: images of a group.
         n_groups: groups.
-        n_cached_groups: groups that have to be cached, so that no predictor is made twice.
+        n_cached_groups: groups that have to be cached, so that no predictor is made
+            twice.
     """
 
     def __init__(
@@ -193,7 +194,8 @@ class BasisPictures:
         n_bytes = groups.n_cached_groups * n_lights * 8 * height * width
         if n_bytes > scaled(MAX_BYTES):
             return Refusal(
-                f"basis pictures of {groups.n_groups} groups take too much memory; make "
+                f"basis pictures of {groups.n_groups} groups take too much memory; "
+                "make "
                 "light the last axes of the grid"
             )
         return None
@@ -364,7 +366,8 @@ class SweepPredictor:
         images_before: images of the scenes before this one.
         deviations: of the predictors that were compared with traced images.
         seconds: that making and comparing them took.
-        rendered_groups: groups whose images are rendered because predictions deviated too much.
+        rendered_groups: groups whose images are rendered because predictions deviated
+            too much.
         method: how images are predicted, or would be.
         refusal: why all images are rendered; None if they are predicted.
     """
@@ -550,7 +553,8 @@ class SweepPredictor:
         reason = None
         if self.rendered_groups:
             reason = (
-                f"{len(self.rendered_groups)} of {self._groups.n_groups} groups were rendered: "
+                f"{len(self.rendered_groups)} of {self._groups.n_groups} groups were "
+                "rendered: "
                 "predicted pictures were too far off"
             )
         predictor_bytes = sum(

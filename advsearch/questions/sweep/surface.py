@@ -148,11 +148,13 @@ def _compute_comparison(
     n_visible: IntArray,
     is_compared: BoolArray,
     wrong: IntArray,
-    n_failures: IntArray,
+    n_failures: int,
     n_images: int,
     part_indices: IntArray,
 ) -> Float64Array:
-    """Return difference, lower and upper bound and p-value of each compared part, (n, 4)."""
+    """Return difference, lower and upper bound and p-value of each compared part, (n,
+    4).
+    """
     n = n_visible[is_compared]
     k = wrong[is_compared]
     difference, low, high = _newcombe(k, n, n_failures - k, n_images - n)
@@ -235,8 +237,8 @@ MIN_RAYS = 4 * MAP_SIZE
 between two pixels.
 """
 MAX_LISTED_PARTS = 5
-"""Parts of each kind that the summary lists, at most, that go with wrong predictions, and
-as many with right ones.
+"""Parts of each kind that the summary lists, at most, that go with wrong predictions,
+and as many with right ones.
 """
 # distance between two listed parts, in units of the object's largest extent, so that
 # a spot is listed once

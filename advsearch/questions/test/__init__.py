@@ -1,4 +1,6 @@
-"""Test claims about a model, each found held, failed or undecided: a gate at every change."""
+"""Test claims about a model, each found held, failed or undecided: a gate at every
+change.
+"""
 
 from __future__ import annotations
 

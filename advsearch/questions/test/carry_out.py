@@ -134,7 +134,9 @@ def _read_suite(config: SuiteConfig) -> Suite:
 def _note_settings(
     context: RunContext[SuiteConfig], suite: Suite, planned: Sequence[PlannedClaim]
 ) -> None:
-    """Note the settings that claims are tested with, so that a resumed run repeats them."""
+    """Note the settings that claims are tested with, so that a resumed run repeats
+    them.
+    """
     run = context.run
     run.store.set_note(SUITE_NOTE, json.dumps(suite.model_dump(mode="json")))
     judged_with = {
@@ -154,7 +156,9 @@ def _note_settings(
 
 @dataclass
 class _SuiteRun:
-    """The state of a suite that is being tested: what is planned, and results so far."""
+    """The state of a suite that is being tested: what is planned, and results so
+    far.
+    """
 
     trial: ClaimTester
     planned: Sequence[PlannedClaim]
@@ -239,7 +243,9 @@ class _SuiteRun:
         )
 
     def _add_result(self, claim: PlannedClaim, tested: ClaimResult) -> None:
-        """Add the result of a claim, with what is expected and the command to repeat it."""
+        """Add the result of a claim, with what is expected and the command to repeat
+        it.
+        """
         repeat = self._repeat_command(f"only={claim.name}") or ""
         expected = self.expected.get(claim.name, "held")
         self.results.append(

@@ -1,4 +1,6 @@
-"""Test each kind of claim: by sampled pictures, a search, or trials of a counterexample."""
+"""Test each kind of claim: by sampled pictures, a search, or trials of a
+counterexample.
+"""
 
 from __future__ import annotations
 
@@ -150,7 +152,9 @@ class ClaimTester:
     def _test_by_search(
         self, pending: ClaimResult, config: AttackConfig
     ) -> ClaimResult:
-        """Test by a search, which runs as a part of this run, that nothing breaks a model."""
+        """Test by a search, which runs as a part of this run, that nothing breaks a
+        model.
+        """
         search = self._make_search(config)
         summary = self.context.run_part(pending.name, search)
         assert isinstance(summary, workbench.AttackSummary)
@@ -356,8 +360,8 @@ class ClaimTester:
             journal: evaluates the queries.
             queries: what to evaluate.
             other_journal: evaluates the other side, if there is one.
-            change: makes the other side's picture of the first one; without it, the other
-                side renders its own.
+            change: makes the other side's picture of the first one; without it, the
+                other side renders its own.
         """
         pictures: dict[int, Tensor | None] = {}
 
@@ -424,7 +428,8 @@ class ClaimTester:
         """
         pending = pending.model_copy(
             update={
-                "statement": f"{config.model} is right where it said {example.wrong_label}"
+                "statement": f"{config.model} is right where it said "
+                f"{example.wrong_label}"
             }
         )
         try:
@@ -458,7 +463,9 @@ class ClaimTester:
         *,
         over: bool,
     ) -> ClaimResult:
-        """Test a counterexample by fresh renders; with `over`, under many conditions."""
+        """Test a counterexample by fresh renders; with `over`, under many
+        conditions.
+        """
         u = problem.domain.project(example.make_configuration(problem.domain.start))
         # trials by which it is added are not repeated as trials of the suite
         prefix = "added " if self.config.add is not None else ""

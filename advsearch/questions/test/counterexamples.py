@@ -51,8 +51,9 @@ FINE_STEP = 1.0 / 32767.0
 COARSE_STEP = 1.0 / 255.0
 """Limits of quantization.
 
-A block of up to `MAX_FINE_VALUES` values is stored in steps of `FINE_STEP`. A larger one,
-such as the texels of a texture, has one of `FORMS`, at best in steps of `COARSE_STEP`.
+A block of up to `MAX_FINE_VALUES` values is stored in steps of `FINE_STEP`. A larger
+one, such as the texels of a texture, has one of `FORMS`, at best in steps of
+`COARSE_STEP`.
 """
 
 FORMS = ((True, 4), (True, 2), (True, 1), (False, 1))
@@ -133,8 +134,8 @@ class _Block(BaseModel):
         Args:
             values: the offsets.
             signs: whether to store only signs; ignored for few values.
-            square: side of the squares of texels that share a value; ignored unless they
-                tile a texture (side, side, 3).
+            square: side of the squares of texels that share a value; ignored unless
+                they tile a texture (side, side, 3).
         """
         is_small = len(values) <= MAX_FINE_VALUES
         side = isqrt(len(values) // 3)
@@ -242,7 +243,8 @@ class Counterexample:
     clean_offsets: Floats
 
     def make_config(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
-        """Return the settings that test it: its own, with the suite's network and machine.
+        """Return the settings that test it: its own, with the suite's network and
+        machine.
 
         Raises:
             InputError: if its settings do not suit that network.
@@ -266,7 +268,9 @@ class Counterexample:
         )
 
     def find_changed_file(self, config: AttackConfig) -> str | None:
-        """Return the name of a file in its settings that has changed, None if none has."""
+        """Return the name of a file in its settings that has changed, None if none
+        has.
+        """
         return directory.summary.changed_file(
             self.files, select_deciding_settings(config)
         )
@@ -279,7 +283,8 @@ class Counterexample:
         """
         if start.numel() != len(self.clean_offsets):
             raise InputError(
-                f"{self.path}: has {len(self.clean_offsets)} numbers, and its scene has "
+                f"{self.path}: has {len(self.clean_offsets)} numbers, and its scene "
+                "has "
                 f"{start.numel()} now; remove it, or "
                 "add the adversarial scene of a new run"
             )
@@ -306,7 +311,9 @@ def compute_scene_digest(description: SceneDescription) -> str:
 
 
 def select_deciding_settings(config: AttackConfig) -> dict[str, Any]:
-    """Return the settings that decide a verdict, without the network, as JSON values."""
+    """Return the settings that decide a verdict, without the network, as JSON
+    values.
+    """
     left_out = NOT_DECIDING | {*MODEL_SETTINGS}
     return {
         name: value for name, value in config.to_json().items() if name not in left_out
@@ -367,7 +374,9 @@ def decide_trials(right: int, wrong: int, *, over: bool) -> str:
 def _is_wrong_on(
     example: Counterexample, problem: Problem, trials: int, *, over: bool
 ) -> bool:
-    """Return whether the run's own model fails on the stored scene, with fresh seeds."""
+    """Return whether the run's own model fails on the stored scene, with fresh
+    seeds.
+    """
     start = problem.domain.start
     u = problem.domain.project(example.make_configuration(start))
     outcomes = list[bool | None]()

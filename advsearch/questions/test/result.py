@@ -293,7 +293,9 @@ def describe_difference(
 def evaluate_search(
     summary: workbench.AttackSummary, config: AttackConfig
 ) -> tuple[str, str, Cause | None]:
-    """Return the verdict of a search, its reason, and the cause if it is not finished."""
+    """Return the verdict of a search, its reason, and the cause if it is not
+    finished.
+    """
     verified = summary.verified
     if summary.ending == "already wrong":
         return FAILED, _clean_reason(summary), None

@@ -69,7 +69,8 @@ class SuiteConfig(Config):
         otherwise="what the suite says, or no limit", unit="seconds", gt=0.0, le=1e9,
     )
     model: str | None = setting_as_in(
-        SceneConfig, "model", default=None, otherwise="what the suite says, or reference"
+        SceneConfig, "model", default=None, otherwise="what the suite says, or "
+                                                      "reference"
     )
     junit: str | None = setting(
         None, "files", "write JUnit XML, a test case for each claim", "a file",
@@ -271,7 +272,8 @@ class Suite(_YamlModel):
 
     Attributes:
         title: what it is about.
-        settings: settings of all claims, as for `attack`; those of a claim override them.
+        settings: settings of all claims, as for `attack`; those of a claim override
+            them.
         seed: root of all random numbers.
         confidence: of each claim that sampled pictures decide.
         seconds: after which nothing more begins, None for no limit.
@@ -320,7 +322,8 @@ class Suite(_YamlModel):
             for known in claim_settings:
                 if known in SUITE_ONLY_SETTINGS:
                     raise InputError(
-                        f"{where}: {known} is said for the whole suite; leave it out there"
+                        f"{where}: {known} is said for the whole suite; leave it out "
+                        "there"
                     )
         changed = {key: value for key, value in changes.items() if value is not None}
         merged = {**self.settings, **claim.settings, "seed": self.seed, **changed}

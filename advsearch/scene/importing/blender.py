@@ -40,8 +40,8 @@ def convert_blend(path: Path, data: bytes) -> bytes:
     """Convert a Blender file to binary glTF.
 
     Raises:
-        FileFormatError: it is no Blender file, Blender is not installed, cannot read it,
-            or takes too long.
+        FileFormatError: it is no Blender file, Blender is not installed, cannot read
+            it, or takes too long.
     """
     if not data.startswith(MAGIC_BYTES):
         raise reading.damaged(path, "a Blender scene", reading.describe_content(data))

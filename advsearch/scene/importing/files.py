@@ -299,8 +299,8 @@ def format_name(
 ) -> str:
     """Format a name out of a file for a message.
 
-    Control characters are escaped, and a name that is longer than `max_length` is cut to
-    half of that.
+    Control characters are escaped, and a name that is longer than `max_length` is cut
+    to half of that.
     """
     cut = name if len(name) <= max_length else name[: max_length // 2]
     text = repr(cut) if quoted else repr(cut)[1:-1]
@@ -316,7 +316,9 @@ def make_safe_name(path: Path) -> str:
 
 
 class UniqueNames:
-    """Makes names unique, and valid in a setting; names in `taken` are not given out."""
+    """Makes names unique, and valid in a setting; names in `taken` are not given
+    out.
+    """
 
     def __init__(self, reserved: Iterable[str] = ()) -> None:
         self._used = set(reserved)
@@ -359,8 +361,8 @@ class Notes:
         notes.take("property", "x")
         list(notes)   # [..., "chair.ply: property 'confidence' is left out"]
 
-    A thing in a file is a kind (a word of the format: ``"property"``, ``"keyword"``) and
-    its name. Each warning is given once.
+    A thing in a file is a kind (a word of the format: ``"property"``, ``"keyword"``)
+    and its name. Each warning is given once.
     """
 
     def __init__(self, path: Path | str) -> None:

@@ -286,6 +286,24 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     return left, right, start[left] == start[right]
 
 
+def _link_windings(
+    left_face: IntArray, right_face: IntArray, same_direction: BoolArray
+) -> tuple[IntArray, IntArray]:
+    """Return the links between the nodes "as it is" (2 f) and "turned" (2 f + 1).
+
+    Args:
+        left_face: one face of each shared edge.
+        right_face: the other face.
+        same_direction: whether both run through the edge in the same direction, so that
+            one of them must be turned.
+    """
+    starts = np.concatenate([2 * left_face, 2 * left_face + 1])
+    ends = np.concatenate(
+        [2 * right_face + same_direction, 2 * right_face + 1 - same_direction]
+    )
+    return starts, ends
+
+
 def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
     """Decide which faces to turn over so that neighbours agree in winding.
 
@@ -299,12 +317,7 @@ def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
     """
     left, right, same_direction = find_shared_edges(soup.faces)
     area = np.linalg.norm(soup.face_vectors(), axis=1)
-    left_face = left // 3
-    right_face = right // 3
-    starts = np.concatenate([2 * left_face, 2 * left_face + 1])
-    ends = np.concatenate(
-        [2 * right_face + same_direction, 2 * right_face + 1 - same_direction]
-    )
+    starts, ends = _link_windings(left // 3, right // 3, same_direction)
     component = find_components(2 * len(area), starts, ends)
     as_is = component[0::2]
     turned = component[1::2]
@@ -314,6 +327,27 @@ def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
     )
     _, shell = np.unique(np.minimum(as_is, turned), return_inverse=True)
     return is_turned, shell.astype(np.int64), bool((as_is == turned).any())
+
+
+def _compute_shell_bounds(
+    soup: Soup, shell: IntArray, n_shells: int
+) -> tuple[Float64Array, Float64Array]:
+    """Return the lower and the upper corner (S, 3) of the box around each shell."""
+    corners = soup.points[soup.faces]
+    lower = np.full((n_shells, 3), np.inf)
+    upper = np.full((n_shells, 3), -np.inf)
+    np.minimum.at(lower, shell, corners.min(axis=1))
+    np.maximum.at(upper, shell, corners.max(axis=1))
+    return lower, upper
+
+
+def _find_closed_shells(
+    soup: Soup, shell: IntArray, face_counts: IntArray
+) -> BoolArray:
+    """Return for each shell (S,) whether all its edges belong to two of its faces."""
+    edge_shell = shell[find_shared_edges(soup.faces)[0] // 3]
+    paired_edges = np.bincount(edge_shell, minlength=len(face_counts)) * 2
+    return np.equal(paired_edges, 3 * face_counts)
 
 
 def _find_inside_out_shells(soup: Soup, shell: IntArray) -> BoolArray:
@@ -331,18 +365,12 @@ def _find_inside_out_shells(soup: Soup, shell: IntArray) -> BoolArray:
     face_counts = np.bincount(shell)
     vectors = soup.face_vectors()
     n_shells = len(face_counts)
-    edge_shell = shell[find_shared_edges(soup.faces)[0] // 3]
-    paired_edges = np.bincount(edge_shell, minlength=n_shells) * 2
-    is_closed = np.equal(paired_edges, 3 * face_counts)
+    is_closed = _find_closed_shells(soup, shell, face_counts)
     volume = _compute_signed_volumes(soup, shell, vectors, face_counts)
     toward = np.nan_to_num((soup.normals * vectors[:, None]).sum(axis=2)).sum(axis=1)
     # Agreement with the file's normals; 0 if it has none.
     agreement = np.bincount(shell, weights=toward, minlength=n_shells)
-    corners = soup.points[soup.faces]
-    lower = np.full((n_shells, 3), np.inf)
-    upper = np.full((n_shells, 3), -np.inf)
-    np.minimum.at(lower, shell, corners.min(axis=1))
-    np.maximum.at(upper, shell, corners.max(axis=1))
+    lower, upper = _compute_shell_bounds(soup, shell, n_shells)
     # If so, the whole object is inside out, hollows included.
     mostly_negative = volume[is_closed].sum() < 0.0
     is_inverted = (volume < 0.0) ^ mostly_negative
@@ -535,15 +563,14 @@ def triangulate(
         much work.
     """
     starts = np.cumsum(counts) - counts
-    distinct_counts, group = np.unique(counts, return_inverse=True)
     triangles = []
     owners = []
     n_wrong = 0
     budget = MOST_WORK
-    for index, count in enumerate(distinct_counts):
+    for count in np.unique(counts):
         if count < 3:
             continue
-        polygons = np.flatnonzero(group == index)
+        polygons = np.flatnonzero(counts == count)
         corners = starts[polygons, None] + np.arange(count)
         cut, n_failed, used = _triangulate_equal(points, corners, budget)
         budget = budget - used
@@ -614,6 +641,86 @@ def _compute_doubled_areas(
     return np.asarray(to_b[..., 0] * to_c[..., 1] - to_b[..., 1] * to_c[..., 0])
 
 
+class _EarCutter:
+    """Polygons (P, n, 2) from which ears are cut off, all in parallel.
+
+    Attributes:
+        triangles: (P, n - 2, 3), the corners of the ears that were cut off.
+        n_cut: (P,) how many of them each polygon has so far.
+        next_corner: (P, n), a linked list of the corners that are left.
+        previous_corner: (P, n), the same list backwards.
+        tip: (P,) the corner that is tried next.
+        n_tries: (P,) corners tried since the last ear.
+        is_failed: (P,) whether a polygon lacked an ear, or was over the budget.
+        area: (P,) doubled.
+        active: the polygons that are not triangulated yet.
+        n_compared: comparisons of a corner with a triangle.
+    """
+
+    def __init__(self, flat: Float64Array) -> None:
+        count, n_corners = flat.shape[:2]
+        corner = np.arange(n_corners)
+        self.flat = flat
+        self.next_corner = np.tile(np.roll(corner, -1), (count, 1))
+        self.previous_corner = np.tile(np.roll(corner, 1), (count, 1))
+        self.triangles = np.zeros((count, n_corners - 2, 3), dtype=np.int64)
+        self.n_cut = np.zeros(count, dtype=np.int64)
+        self.tip = np.zeros(count, dtype=np.int64)
+        self.n_tries = np.zeros(count, dtype=np.int64)
+        self.is_failed = np.zeros(count, dtype=np.bool_)
+        successors = np.roll(flat, -1, axis=1)
+        doubled_areas = _compute_doubled_areas(flat, successors, np.zeros(2))
+        self.area = np.abs(doubled_areas.sum(axis=1))
+        self.dent, self.is_present = _find_dents(flat, self.area)
+        self.dent_points = np.take_along_axis(flat, self.dent[:, :, None], axis=1)
+        self.active = np.arange(count)
+        self.n_compared = 0
+
+    def step(self, budget: int) -> None:
+        """Try the tip of every active polygon; cut it off if it is an ear.
+
+        Args:
+            budget: limit of the comparisons; then all ears are cut off untested.
+        """
+        active = self.active
+        b = self.tip[active]
+        a = self.previous_corner[active, b]
+        c = self.next_corner[active, b]
+        is_cut = self._decide_cuts(a, b, c, budget)
+        self.tip[active] = c
+        self.n_tries[active] += 1
+        self._cut(active[is_cut], a[is_cut], b[is_cut], c[is_cut])
+        self.active = active[self.n_cut[active] < self.triangles.shape[1]]
+
+    def _decide_cuts(
+        self, a: IntArray, b: IntArray, c: IntArray, budget: int
+    ) -> BoolArray:
+        """Return which active polygons lose their corner b, between a and c."""
+        active = self.active
+        n_left = self.flat.shape[1] - self.n_cut[active]
+        is_cut = n_left == 3
+        is_hopeless = self.n_tries[active] >= n_left
+        if self.n_compared < budget:
+            dent_points = self.dent_points[active]
+            self.n_compared += dent_points.size // 2
+            corners = [self.flat[active, corner] for corner in (a, b, c)]
+            min_area = _MIN_AREA * self.area[active]
+            is_cut |= _is_ear(corners, dent_points, self.is_present[active], min_area)
+        else:
+            is_hopeless[:] = True
+        self.is_failed[active] |= is_hopeless & ~is_cut
+        return np.asarray(is_cut | is_hopeless)
+
+    def _cut(self, rows: IntArray, a: IntArray, b: IntArray, c: IntArray) -> None:
+        """Cut the ears a, b, c off the polygons in `rows`."""
+        self.triangles[rows, self.n_cut[rows]] = np.stack([a, b, c], axis=1)
+        self.is_present[rows] &= self.dent[rows] != b[:, None]
+        self.next_corner[rows, a] = c
+        self.previous_corner[rows, c] = a
+        self.n_tries[rows] = 0
+        self.n_cut[rows] += 1
+
+
 def _cut_ears(flat: Float64Array, budget: int) -> tuple[IntArray, int, int]:
     """Triangulate polygons (P, n, 2) by cutting off ears, in all polygons in parallel.
 
@@ -629,54 +736,11 @@ def _cut_ears(flat: Float64Array, budget: int) -> tuple[IntArray, int, int]:
         The corners of the triangles (P, n - 2, 3); how many polygons with an area
         lacked an ear at some time, or were over the budget; and the comparisons made.
     """
-    count, n_corners = flat.shape[:2]
-    # Linked lists of the corners that are left.
-    after = np.tile(np.roll(np.arange(n_corners), -1), (count, 1))
-    before = np.tile(np.roll(np.arange(n_corners), 1), (count, 1))
-    triangles = np.zeros((count, n_corners - 2, 3), dtype=np.int64)
-    n_cut, tip, n_tries = (np.zeros(count, dtype=np.int64) for _ in range(3))
-    is_failed = np.zeros(count, dtype=np.bool_)
-    area = np.abs(
-        _compute_doubled_areas(flat, np.roll(flat, -1, axis=1), np.zeros(2)).sum(axis=1)
-    )
-    dent, is_present = _find_dents(flat, area)
-    dent_points = np.take_along_axis(flat, dent[:, :, None], axis=1)
-    active = np.arange(count)
-    n_compared = 0
-    while len(active):
-        b = tip[active]
-        a = before[active, b]
-        c = after[active, b]
-        n_left = n_corners - n_cut[active]
-        is_cut = n_left == 3
-        is_hopeless = n_tries[active] >= n_left
-        if n_compared < budget:
-            n_compared += dent_points[active].size // 2
-            corners = [flat[active, corner] for corner in (a, b, c)]
-            is_cut |= _is_ear(
-                corners,
-                dent_points[active],
-                is_present[active],
-                _MIN_AREA * area[active],
-            )
-        else:
-            is_hopeless[:] = True
-        is_failed[active] |= is_hopeless & ~is_cut
-        is_cut |= is_hopeless
-        tip[active] = c
-        n_tries[active] += 1
-        rows = active[is_cut]
-        a = a[is_cut]
-        b = b[is_cut]
-        c = c[is_cut]
-        triangles[rows, n_cut[rows]] = np.stack([a, b, c], axis=1)
-        is_present[rows] &= dent[rows] != b[:, None]
-        after[rows, a] = c
-        before[rows, c] = a
-        n_tries[rows] = 0
-        n_cut[rows] += 1
-        active = active[n_cut[active] < n_corners - 2]
-    return triangles, int((is_failed & (area > _MIN_AREA)).sum()), n_compared
+    cutter = _EarCutter(flat)
+    while len(cutter.active):
+        cutter.step(budget)
+    is_wrong = cutter.is_failed & (cutter.area > _MIN_AREA)
+    return cutter.triangles, int(is_wrong.sum()), cutter.n_compared
 
 
 def _find_dents(flat: Float64Array, area: Float64Array) -> tuple[IntArray, BoolArray]:

@@ -169,8 +169,8 @@ def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
 
 
 MAX_DATA_SIZE = 1 << 28
-"""Limit of the bytes of all views, and of all accessors, of a file; they may overlap, so
-the size of the file is no bound.
+"""Limit of the bytes of all views, and of all accessors, of a file; they may overlap,
+so the size of the file is no bound.
 """
 LARGEST_TREE = 20_000  # limit of the nodes, and of the drawn primitives, of a file
 DEEPEST_TREE = 500  # limit of the nodes from the root to a leaf
@@ -181,8 +181,8 @@ SUPPORTED_EXTENSIONS = tuple(
 )
 """Extensions that are understood."""
 _APPEARANCE_PREFIXES = ("KHR_materials_", "KHR_xmp")
-"""Prefixes of extensions without which a file looks different but has the same geometry:
-warnings name them.
+"""Prefixes of extensions without which a file looks different but has the same
+geometry: warnings name them.
 """
 
 
@@ -192,6 +192,30 @@ def is_splat_name(name: str) -> bool:
     These are KHR_gaussian_splatting and the extensions that compress it.
     """
     return "gaussian_splat" in name.lower()
+
+
+def _check_references(path: Path, header: Header) -> None:
+    """Check that everything that a header refers to is in the header.
+
+    Raises:
+        FileFormatError: it is not.
+    """
+    for entry in header.iterate_entries():
+        for kind, index in entry.iterate_references():
+            count = len(getattr(header, kind))
+            if index >= count:
+                raise damaged(
+                    path, f"glTF with {index + 1} {kind}, as it refers to", f"{count}"
+                )
+    for animation in header.animations:
+        max_index = max((channel.curve for channel in animation.channels), default=-1)
+        n_samplers = len(animation.samplers)
+        if max_index >= n_samplers:
+            raise damaged(
+                path,
+                f"glTF with {max_index + 1} samplers of an animation, as it refers to",
+                f"{n_samplers}",
+            )
 
 
 def check_header(path: Path, header: Header) -> None:
@@ -209,22 +233,7 @@ def check_header(path: Path, header: Header) -> None:
     )
     if needed:
         raise _make_unsupported_error(path, needed)
-    for entry in header.iterate_entries():
-        for kind, index in entry.iterate_references():
-            count = len(getattr(header, kind))
-            if index >= count:
-                raise damaged(
-                    path, f"glTF with {index + 1} {kind}, as it refers to", f"{count}"
-                )
-    for animation in header.animations:
-        max_index = max((channel.curve for channel in animation.channels), default=-1)
-        n_samplers = len(animation.samplers)
-        if max_index >= n_samplers:
-            raise damaged(
-                path,
-                f"glTF with {max_index + 1} samplers of an animation, as it refers to",
-                f"{n_samplers}",
-            )
+    _check_references(path, header)
     accessor_sizes = (
         entry.count
         * entry.width

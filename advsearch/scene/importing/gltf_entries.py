@@ -377,7 +377,9 @@ class MaterialEntry(Entry):
 
     @property
     def layout_texture(self) -> TextureUse | None:
-        """The texture whose coordinates the mesh gets: that of the base color, if any."""
+        """The texture whose coordinates the mesh gets: that of the base color, if
+        any.
+        """
         return (
             self.surface.baseColorTexture or self.normalTexture or self.emissiveTexture
         )

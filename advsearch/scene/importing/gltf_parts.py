@@ -76,7 +76,9 @@ EXTENSION_NOTES = {
     "KHR_materials_variants": " has variants of its materials ({name}); those that it "
     "shows by itself are taken",
 }
-"""Sentence about each extension; `UNKNOWN_EXTENSION_NOTE` is that of all others not understood."""
+"""Sentence about each extension; `UNKNOWN_EXTENSION_NOTE` is that of all others not
+understood.
+"""
 UNKNOWN_EXTENSION_NOTE = " uses {name}, which is not understood and left out"
 MAX_SENTENCE_LENGTH = 500  # characters of what the reader of OpenUSD says
 DIRECTIONAL_LIGHT_DISTANCE = 1000.0  # distance of a directional light, in object sizes
@@ -222,7 +224,10 @@ def describe_left_out(header: Header, file: str) -> list[str]:
 
 def describe_changed_lights(header: Header, file: str) -> list[str]:
     """Describe the lights and cameras of a file that are imported as something else."""
-    directional = f"directional light{{s}}, here as lamps {DIRECTIONAL_LIGHT_DISTANCE:g} object sizes away"
+    directional = (
+        f"directional light{{s}}, here as lamps "
+        f"{DIRECTIONAL_LIGHT_DISTANCE:g} object sizes away"
+    )
     ranged = "light{s} with a range, which is left out: light reaches beyond it"
     kinds = {
         directional: (light.type == "directional" for light in header.lights),
@@ -622,7 +627,8 @@ def _pad(
 
 
 def _enlarge(picture: Float32Array, axis: int) -> Float32Array:
-    """Enlarge an image to at least `SMALL_IMAGE_SIZE` texels along an axis, interpolating linearly.
+    """Enlarge an image to at least `SMALL_IMAGE_SIZE` texels along an axis,
+    interpolating linearly.
 
     At that size a border of one texel is not visible.
     """
@@ -656,6 +662,27 @@ DEFAULT_MATERIAL_NOTE = (
 )
 
 
+def _list_instances(header: Header) -> list[tuple[int, int, Float64Array]]:
+    """Return node, mesh and pose of everything that is drawn, in order of the nodes."""
+    poses = sorted(gltf_skeleton.iterate_poses(header), key=lambda item: item[0])
+    return [
+        (node, mesh, pose)
+        for node, pose in poses
+        if (mesh := header.nodes[node].mesh) is not None
+    ]
+
+
+def _select_with_faces(
+    pieces: Mapping[tuple[int, int], PrimitiveData | None],
+) -> dict[tuple[int, int], PrimitiveData]:
+    """Return the primitives that have faces, by the indices of mesh and primitive."""
+    return {
+        key: piece
+        for key, piece in pieces.items()
+        if piece is not None and len(piece.part.faces)
+    }
+
+
 @np.errstate(all="ignore")
 def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read the primitives of a glTF file that its nodes draw, as one part each.
@@ -665,58 +692,29 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """
     file = GltfFile(path, data)
     header = file.header
-    poses = sorted(gltf_skeleton.iterate_poses(header), key=lambda item: item[0])
-    # Node, mesh and pose of everything that is drawn.
-    instances = [
-        (node, mesh, pose)
-        for node, pose in poses
-        if (mesh := header.nodes[node].mesh) is not None
-    ]
+    instances = _list_instances(header)
     mesh_nodes = [node for node, _, _ in instances]
-    moving = gltf_skeleton.count_targets(file, mesh_nodes)
+    target_counts = gltf_skeleton.count_targets(file, mesh_nodes)
     pieces = _read_pieces(file, mesh_nodes)
-    with_faces = {
-        key: piece
-        for key, piece in pieces.items()
-        if piece is not None and len(piece.part.faces)
-    }
+    with_faces = _select_with_faces(pieces)
     if not with_faces:
         raise _make_no_faces_error(path, header, bool(pieces))
     note_left_out(header, notes)
     _note_pieces(header, list(pieces), with_faces, notes)
     parts_by_key = _make_parts(GltfSurfaces(file, notes), with_faces)
     skins = _read_skins(file, mesh_nodes)
-    skeleton = gltf_skeleton.read_skeleton(file, moving)
+    skeleton = gltf_skeleton.read_skeleton(file, target_counts)
     if skeleton is not None:
         _note_skeleton(skeleton, notes)
 
-    parts = []
-    for node, mesh, pose in instances:
-        skin_index = header.nodes[node].skin
-        skin = None if skin_index is None else skins[skin_index]
-        for primitive_index in range(len(header.meshes[mesh].primitives)):
-            key = (mesh, primitive_index)
-            if key not in parts_by_key:
-                continue
-            piece = with_faces[key]
-            part = parts_by_key[key]
-            if skeleton is not None:
-                part = _make_movable(file, part, piece, node, skin, skeleton)
-            if skin is None or piece.vertex_joints is None:
-                part = transform_part(part, pose)
-            else:
-                _, _, matrices = skin
-                part = gltf_skeleton.pose_part(
-                    path, part, piece.vertex_joints, matrices
-                )
-            parts.append(replace(part, node=node))
+    parts = _pose_parts(file, instances, parts_by_key, with_faces, skins, skeleton)
     check_faces(path, sum(len(part.faces) for part in parts))
     return parts
 
 
 SkinPose = tuple[IntArray, Float64Array, Float64Array]
-"""A skin at rest: its joints (J,), which are nodes; its inverse bind matrices (J, 4, 4),
-from the mesh to each joint; and the matrices (J, 4, 4) from the mesh to the scene.
+"""A skin at rest: its joints (J,), which are nodes; its inverse bind matrices (J, 4,
+4), from the mesh to each joint; and the matrices (J, 4, 4) from the mesh to the scene.
 """
 
 
@@ -832,6 +830,45 @@ def _note_skeleton(skeleton: Skeleton, notes: Notes) -> None:
     notes.warn(f" is shown at rest: the control body moves it{clips}")
 
 
+def _pose_parts(
+    file: GltfFile,
+    instances: Sequence[tuple[int, int, Float64Array]],
+    parts_by_key: Mapping[tuple[int, int], ImportedPart],
+    with_faces: Mapping[tuple[int, int], PrimitiveData],
+    skins: Mapping[int, SkinPose],
+    skeleton: Skeleton | None,
+) -> list[ImportedPart]:
+    """Return the primitives that nodes draw, in the pose of each node.
+
+    Args:
+        file: the glTF file.
+        instances: node, mesh and pose of everything that is drawn.
+        parts_by_key: the primitives as parts, by the indices of mesh and primitive.
+        with_faces: their data.
+        skins: the skins of the nodes, by index.
+        skeleton: that of the file, None if nothing in it moves.
+    """
+    parts = []
+    for node, mesh, pose in instances:
+        skin_index = file.header.nodes[node].skin
+        skin = None if skin_index is None else skins[skin_index]
+        for primitive_index in range(len(file.header.meshes[mesh].primitives)):
+            key = (mesh, primitive_index)
+            if key not in parts_by_key:
+                continue
+            vertex_joints = with_faces[key].vertex_joints
+            part = parts_by_key[key]
+            if skeleton is not None:
+                part = _make_movable(file, part, with_faces[key], node, skin, skeleton)
+            if skin is None or vertex_joints is None:
+                part = transform_part(part, pose)
+            else:
+                _, _, matrices = skin
+                part = gltf_skeleton.pose_part(file.path, part, vertex_joints, matrices)
+            parts.append(replace(part, node=node))
+    return parts
+
+
 def _make_movable(
     file: GltfFile,
     part: ImportedPart,
@@ -883,6 +920,18 @@ class PrimitiveData(NamedTuple):
     packed_uvs: Float64Array | None  # (V, 2) of its texture of roughness and metallic
 
 
+def _read_vertex_colors(
+    file: GltfFile, attributes: Mapping[str, int], used: IntArray, faces: IntArray
+) -> tuple[Float64Array | None, bool]:
+    """Return colors (F, 3, 3) of faces, if any, and whether an alpha is below 1."""
+    if "COLOR_0" not in attributes:
+        return None, False
+    rgba = file.read_numbers(attributes["COLOR_0"], used)
+    rgba = np.clip(np.nan_to_num(rgba), 0.0, 1.0)
+    has_alpha = rgba.shape[1] == 4 and bool((rgba[:, 3] < 1.0).any())
+    return rgba[:, :3][faces], has_alpha
+
+
 def read_primitive(
     file: GltfFile, primitive: Primitive, extras: object, is_skinned: bool
 ) -> PrimitiveData | None:
@@ -898,39 +947,37 @@ def read_primitive(
         FileFormatError: a face refers to a vertex that is not there.
     """
     attributes = primitive.attributes
-    header = file.header
     if primitive.mode < TRIANGLES or "POSITION" not in attributes:
         return None
     used, faces = _used_vertices(file, primitive)
-    vertices = file.read_numbers(attributes["POSITION"], used)
+    positions = file.read_numbers(attributes["POSITION"], used)
     material = MaterialEntry()
     if primitive.material is not None:
-        material = header.materials[primitive.material]
+        material = file.header.materials[primitive.material]
     uvs = _read_texture_coordinates(file, attributes, material.layout_texture, used)
-    packed = material.surface.metallicRoughnessTexture
     packed_uvs = None
-    if packed is not None:
+    if (packed := material.surface.metallicRoughnessTexture) is not None:
         packed_uvs = _read_texture_coordinates(file, attributes, packed, used)
-    colors = None
-    see_through = False
-    if "COLOR_0" in attributes:
-        rgba = file.read_numbers(attributes["COLOR_0"], used)
-        rgba = np.clip(np.nan_to_num(rgba), 0.0, 1.0)
-        colors = rgba[:, :3][faces]
-        has_alpha = rgba.shape[1] == 4 and bool((rgba[:, 3] < 1.0).any())
-        see_through = material.alphaMode in TRANSPARENT_MODES and has_alpha
+    colors, has_alpha = _read_vertex_colors(file, attributes, used, faces)
+    see_through = material.alphaMode in TRANSPARENT_MODES and has_alpha
     normals = None
     if "NORMAL" in attributes:
         normals = file.read_numbers(attributes["NORMAL"], used)
     part = ImportedPart(
-        vertices, faces, normals, uvs, colors, ImportedSurface(), flat=True
+        positions, faces, normals, uvs, colors, ImportedSurface(), flat=True
     )
-    bound = (
-        gltf_skeleton.read_vertex_joints(file, primitive, used) if is_skinned else None
-    )
+    vertex_joints = None
+    if is_skinned:
+        vertex_joints = gltf_skeleton.read_vertex_joints(file, primitive, used)
     targets, turns = gltf_skeleton.read_targets(file, primitive, used, extras)
     return PrimitiveData(
-        part, primitive.material, see_through, bound, targets, turns, packed_uvs
+        part,
+        primitive.material,
+        see_through,
+        vertex_joints,
+        targets,
+        turns,
+        packed_uvs,
     )
 
 

@@ -1,4 +1,6 @@
-"""Nodes, skins, morph targets and clips of glTF files (glTF 2.0, sections 3.5 to 3.11)."""
+"""Nodes, skins, morph targets and clips of glTF files (glTF 2.0, sections 3.5 to
+3.11).
+"""
 
 from __future__ import annotations
 
@@ -34,8 +36,8 @@ from advsearch.trust.stored_files import check_most
 
 MAX_JOINT_SETS = 8  # limit of the sets of four joints of a vertex
 MAX_KEY_NUMBERS = 1 << 24
-"""Limit of the numbers in the keys of all clips, before `scaled`; many keys may share one
-accessor.
+"""Limit of the numbers in the keys of all clips, before `scaled`; many keys may share
+one accessor.
 """
 MAX_MOVES = 1 << 25
 """Limit of the vertices that all morph targets move, plus the inverse bind matrices;
@@ -382,12 +384,24 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
     )
 
 
+def _count_key_numbers(
+    header: Header, used_channels: Sequence[Sequence[Channel]]
+) -> int:
+    """Return how many numbers the keyframes of channels have, in all animations."""
+    n_numbers = 0
+    for animation, channels in zip(header.animations, used_channels, strict=True):
+        for channel in channels:
+            keys = header.accessors[animation.samplers[channel.curve].output]
+            n_numbers += keys.count * keys.width
+    return n_numbers
+
+
 def _read_clips(
     file: GltfFile, target_counts: Mapping[int, int], skins: Collection[int]
 ) -> tuple[Clip, ...]:
     """Return the clips of a file, of which only what moves geometry is read."""
     header = file.header
-    joints = {joint for skin in skins for joint in header.skins[skin].joints}
+    joints = (joint for skin in skins for joint in header.skins[skin].joints)
     moving_nodes = with_ancestors(header.parents, {*target_counts, *joints})
 
     def moves_geometry(channel: Channel) -> bool:
@@ -403,17 +417,18 @@ def _read_clips(
         list(filter(moves_geometry, animation.channels))
         for animation in header.animations
     ]
-    n_numbers = 0
-    for animation, channels in zip(header.animations, used_channels, strict=True):
-        for channel in channels:
-            keys = header.accessors[animation.samplers[channel.curve].output]
-            n_numbers += keys.count * keys.width
-    check_most(file.path, n_numbers, MAX_KEY_NUMBERS, "clips of at most {} numbers")
+    check_most(
+        file.path,
+        _count_key_numbers(header, used_channels),
+        MAX_KEY_NUMBERS,
+        "clips of at most {} numbers",
+    )
     names = UniqueNames()
     clips = list[Clip]()
-    for index, channels in enumerate(used_channels):
+    for index, (animation, channels) in enumerate(
+        zip(header.animations, used_channels, strict=True)
+    ):
         if channels:
-            animation = header.animations[index]
             tracks = [
                 _read_track(file, animation, channel, target_counts)
                 for channel in channels

@@ -1,8 +1,8 @@
 """Readers of images of linear radiance: OpenEXR (.exr) and Radiance (.hdr).
 
 The format of OpenEXR is in its project's "Technical Introduction to OpenEXR" and
-"OpenEXR File Layout". Radiance has shared-exponent RGB, run-length encoded line by line,
-as in the Radiance reference manual, "File Formats" (Ward 1997); XYZE images are
+"OpenEXR File Layout". Radiance has shared-exponent RGB, run-length encoded line by
+line, as in the Radiance reference manual, "File Formats" (Ward 1997); XYZE images are
 rejected. None of our dependencies reads it, except Mitsuba, which must not be imported
 before its LLVM has been chosen.
 """
@@ -314,6 +314,14 @@ def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
     return plane
 
 
+def _intersect_ranges(
+    data_start: int, data_length: int, start: int, length: int
+) -> slice:
+    """Return what two ranges have in common; it stops before its start if nothing."""
+    stop = min(data_start + data_length, start + length)
+    return slice(max(data_start, start), stop)
+
+
 def _crop_to_display_window(
     header: Mapping[str, Any], planes: Planes, notes: list[str]
 ) -> Planes:
@@ -322,15 +330,13 @@ def _crop_to_display_window(
     (top, left), (height, width) = _read_window(header, "displayWindow")
     if (data_top, data_left) == (top, left) and data_size == (height, width):
         return planes
-    data_bottom = data_top + data_size[0]
-    data_right = data_left + data_size[1]
-    rows = slice(max(data_top, top), min(data_bottom, top + height))
-    columns = slice(max(data_left, left), min(data_right, left + width))
+    rows = _intersect_ranges(data_top, data_size[0], top, height)
+    columns = _intersect_ranges(data_left, data_size[1], left, width)
     is_cropped = (
         rows.start > data_top
         or columns.start > data_left
-        or rows.stop < data_bottom
-        or columns.stop < data_right
+        or rows.stop < data_top + data_size[0]
+        or columns.stop < data_left + data_size[1]
     )
     if is_cropped:
         notes.append("its data beyond the display window is left out")
@@ -347,8 +353,8 @@ def _crop_to_display_window(
             ]
         return result
 
-    red, green, blue = map(crop, planes)
-    return red, green, blue
+    red, green, blue = planes
+    return crop(red), crop(green), crop(blue)
 
 
 Bytes = npt.NDArray[np.uint8]
@@ -356,31 +362,16 @@ _RESOLUTION = re.compile(rb"([-+])([YX]) +(\d{1,6}) +([-+])([YX]) +(\d{1,6})\r?\
 _NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
-def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[str]]:
-    """Unpack a Radiance RGBE picture.
+def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
+    """Return the pixels (H, W, 4) of a Radiance picture, row 0 on top.
 
-    Returns:
-        Pixels (H, W, 4) uint8, three mantissas and an exponent, row 0 on top: `decode_rgbe`
-        makes floats of them, which take three times the memory. Factors (3,) float32 of
-        the linear values, the inverse of all COLORCORR lines. Clauses about what is
-        left out.
+    Args:
+        path: of the picture, for messages.
+        body: what follows its header: a line with its size, and scanlines.
 
     Raises:
-        FileFormatError: the file is no Radiance picture, has XYZ colors, is too large,
-            or is cut short.
+        FileFormatError: the size is none, or too large, or scanlines are missing.
     """
-    end = re.search(rb"\r?\n\r?\n", data)
-    if not data.startswith(b"#?") or not end:
-        got = describe_content(data) if not data.startswith(b"#?") else "half a header"
-        raise damaged(path, "a Radiance .hdr picture", got)
-    header = data[: end.start()]
-    body = data[end.end() :]
-    coding = re.search(rb"^FORMAT=\s*(\S+)", header, re.MULTILINE)
-    if coding and coding[1] != b"32-bit_rle_rgbe":
-        got = format_name(coding[1].decode("latin-1"), quoted=False)
-        raise FileFormatError(
-            f"{path}: expected FORMAT=32-bit_rle_rgbe, got {got}; convert it to RGB"
-        )
     size = _RESOLUTION.match(body)
     if not size or not int(size[3]) or not int(size[6]) or size[2] == size[5]:
         line = body[:30].split(b"\n")[0].decode("latin-1")
@@ -400,6 +391,35 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
     pixels = pixels[::line_step, ::pixel_step]
     if size[2] != b"Y":
         pixels = pixels.transpose(1, 0, 2)
+    return pixels
+
+
+def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[str]]:
+    """Unpack a Radiance RGBE picture.
+
+    Returns:
+        Pixels (H, W, 4) uint8, three mantissas and an exponent, row 0 on top:
+        `decode_rgbe` makes floats of them, which take three times the memory. Factors
+        (3,) float32 of the linear values, the inverse of all COLORCORR lines. Clauses
+        about what is left out.
+
+    Raises:
+        FileFormatError: the file is no Radiance picture, has XYZ colors, is too large,
+            or is cut short.
+    """
+    end = re.search(rb"\r?\n\r?\n", data)
+    if not data.startswith(b"#?") or not end:
+        got = describe_content(data) if not data.startswith(b"#?") else "half a header"
+        raise damaged(path, "a Radiance .hdr picture", got)
+    header = data[: end.start()]
+    body = data[end.end() :]
+    coding = re.search(rb"^FORMAT=\s*(\S+)", header, re.MULTILINE)
+    if coding and coding[1] != b"32-bit_rle_rgbe":
+        got = format_name(coding[1].decode("latin-1"), quoted=False)
+        raise FileFormatError(
+            f"{path}: expected FORMAT=32-bit_rle_rgbe, got {got}; convert it to RGB"
+        )
+    pixels = _read_upright_pixels(path, body)
     factors, notes = _read_color_corrections(header)
     return pixels, factors, notes
 

@@ -33,7 +33,9 @@ highlights.
 """
 NORMAL_MAPS = ("norm", "map_kn", "map_bump", "bump")
 UV_MAPS = ("map_kd", "map_d", *NORMAL_MAPS, "map_ke")
-"""Maps that are sampled at texture coordinates, with the layout of the first of them."""
+"""Maps that are sampled at texture coordinates, with the layout of the first of
+them.
+"""
 # Channels of an image by the value of ``-imfchan``.
 CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
 DEFAULT_OPTIONS = {
@@ -61,8 +63,8 @@ class MtlSurface:
 class MtlReader:
     """Reads the material files of a mesh file, and converts materials to surfaces.
 
-    `find_mapped_faces` returns UVs (F, 3, 2) and areas (F,) of the faces with a material, by its
-    name and a UDIM square.
+    `find_mapped_faces` returns UVs (F, 3, 2) and areas (F,) of the faces with a
+    material, by its name and a UDIM square.
     """
 
     references: References
@@ -91,7 +93,8 @@ class MtlReader:
         materials, stray_keywords = parse_mtl(text, file)
         for keyword in stray_keywords:
             self.notes.record(
-                f"before the first material of {format_name(file, quoted=False)}, statement",
+                f"before the first material of {format_name(file, quoted=False)}, "
+                "statement",
                 keyword,
             )
         for material in materials:
@@ -160,7 +163,8 @@ class MtlReader:
         if find_square(numbered) == 0 or any(exists):
             return [square for square in candidates if square]
         self.notes.warn(
-            f"{format_name(numbered)} is named like one of several pictures (UDIM), and "
+            f"{format_name(numbered)} is named like one of several pictures (UDIM), "
+            "and "
             "there is none for the "
             f"faces in {', '.join(map(str, others[:8]))}: it repeats there; put "
             "those pictures beside it"
@@ -202,7 +206,9 @@ class MtlReader:
         return MtlSurface(surface, first.scale, first.offset, is_clamped)
 
     def _parse_uses(self, material: MtlMaterial, square: int) -> dict[str, MapUse]:
-        """Return the maps of a material by keyword, with the images of a UDIM square."""
+        """Return the maps of a material by keyword, with the images of a UDIM
+        square.
+        """
         uses = dict[str, MapUse]()
         for key in (*UV_MAPS, "map_pr", "map_pm"):
             use = self._parse_use(material, key)
@@ -224,7 +230,10 @@ class MtlReader:
         """Remove the maps whose scale and offset differ from those of the first."""
         for key in [key for key in UV_MAPS if key in uses]:
             if (uses[key].scale, uses[key].offset) != (first.scale, first.offset):
-                what = f"{material.spelling[key]} of the material {format_name(material.name)}"
+                what = (
+                    f"{material.spelling[key]} of the material "
+                    f"{format_name(material.name)}"
+                )
                 self.notes.warn(
                     f"{what} lies elsewhere than its other maps (-s, -o); "
                     "it is left out"
@@ -247,7 +256,10 @@ class MtlReader:
             rgb = np.clip(np.broadcast_to(values[:3], (3,)), 0.0, 1.0)
             color = rgb.astype(np.float32)
         elif "kd" in material.statements:
-            what = f"the Kd {format_name(rest)} of the material {format_name(material.name)}"
+            what = (
+                f"the Kd {format_name(rest)} of the material "
+                f"{format_name(material.name)}"
+            )
             self.notes.warn(f"{what} is no colour; neutral grey is used instead")
         instead = f"{describe_substitute(color)} is used instead"
         words = f"{material.file} names the texture {{name}}, which {{why}}; {instead}"
@@ -737,8 +749,8 @@ def _parse_pair(options: dict[str, str], key: str, default: Pair) -> Pair:
 
     Numbers that are too large to compute with are replaced by the defaults.
     """
-    words = options.get(key, "").split()[:2]
-    u, v = (*map(float, words), *default[len(words) :])
+    numbers = [float(word) for word in options.get(key, "").split()[:2]]
+    u, v = [*numbers, *default[len(numbers) :]]
     return (u, v) if abs(u) < 1e6 and abs(v) < 1e6 else default
 
 

@@ -1,4 +1,5 @@
-"""Objects from mesh files: ``--object path.obj`` and others of `advsearch.files.MESHES`.
+"""Objects from mesh files: ``--object path.obj`` and others of
+`advsearch.files.MESHES`.
 
 A file is read as a list of parts: one piece of geometry with one surface each, in the
 file's own coordinates. The readers are our own, since existing ones silently drop what
@@ -111,8 +112,8 @@ def import_object(
         path: a file of one of the kinds of `advsearch.files.MESHES`.
         up: the axis of the file that points up; None: that of its format, or else the
             one that its shape suggests.
-        facing: the axis of the file, one of `FRONT_AXES`, along which the object's front
-            faces; None: that of its format (`find_front`).
+        facing: the axis of the file, one of `FRONT_AXES`, along which the object's
+            front faces; None: that of its format (`find_front`).
 
     Raises:
         FileFormatError: the file is missing, of another kind, corrupt, or has no faces;

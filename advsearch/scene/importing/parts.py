@@ -35,8 +35,8 @@ MIN_NORMAL_Z = 0.01
 MIN_BLUENESS = 0.1
 MAX_LENGTH_ERROR = 0.2
 MIN_NORMAL_FRACTION = 0.9
-"""Largest error of the length of a normal in an image, and the fraction of the texels for
-which it must hold.
+"""Largest error of the length of a normal in an image, and the fraction of the texels
+for which it must hold.
 """
 
 
@@ -80,8 +80,8 @@ def encode_normals(normals: npt.NDArray[np.floating]) -> Float32Array:
 
 
 NEUTRAL_GREY = 0.5  # display-referred grey of an object without material
-# Limit of the radiance that a surface emits; white in the light of a bundled environment
-# is about 1.
+# Limit of the radiance that a surface emits; white in the light of a bundled
+# environment is about 1.
 MAX_RADIANCE = 1e5
 
 
@@ -135,7 +135,9 @@ class ImportedSurface:
         return color is not None and color.shape[-1] == 4 and not color[..., 3].any()
 
     def has_same_maps(self, other: ImportedSurface) -> bool:
-        """Return whether two surfaces have equal base colors, normal maps and emission."""
+        """Return whether two surfaces have equal base colors, normal maps and
+        emission.
+        """
         self_maps = (self.color, self.texture, self.normal_map, self.emission)
         pairs = zip(
             self_maps,

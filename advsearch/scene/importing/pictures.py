@@ -62,8 +62,8 @@ def load_display_image(
         limit: longest side of the result; larger images are averaged down in linear
             light, weighted by opacity. None: no limit.
         path: where it is from, for messages.
-        keep_alpha: keep it as a fourth channel, 1 if the image has none; otherwise it is
-            dropped.
+        keep_alpha: keep it as a fourth channel, 1 if the image has none; otherwise it
+            is dropped.
         is_raw: it holds numbers, as a normal map does, and no colors; larger ones are
             averaged down as they are.
 
@@ -198,8 +198,8 @@ LARGEST_SUM = 2 * LARGEST_PIXELS
 """
 UNREADABLE = "cannot be read as a picture"
 MAX_FULL_TEXTURES = 16
-"""Materials whose textures may be as large as `TEXTURE_LIMIT`; more are baked into one map,
-so that smaller ones suffice.
+"""Materials whose textures may be as large as `TEXTURE_LIMIT`; more are baked into one
+map, so that smaller ones suffice.
 """
 
 
@@ -247,7 +247,8 @@ class FileImages:
         name: str,
         message: str,
     ) -> Float32Array | None:
-        """Return an image's values, as `load_display_image`; None, and a note, if it fails.
+        """Return an image's values, as `load_display_image`; None, and a note, if it
+        fails.
 
         Args:
             key: the same for the same image.

@@ -243,14 +243,31 @@ def _read_rows(
     )
     if lists_differ:
         starts, end = walk_rows(element.count)
+    _store_values(element, starts, values, counts)
+    return end
+
+
+def _store_values(
+    element: Element,
+    starts: Mapping[str, IntArray],
+    values: Mapping[str, Numbers],
+    counts: Mapping[str, Numbers],
+) -> None:
+    """Fill in the values of an element.
+
+    Args:
+        element: its scalars and lists are set.
+        starts: the byte at which each property begins, in each row.
+        values: the numbers of each property's type that begin at each byte.
+        counts: those of the type of the count; only of lists.
+    """
     for name, property_starts in starts.items():
         if name in counts:
             lengths = counts[name][property_starts].astype(np.int64)
-            first_values = property_starts + widths[name]
+            first_values = property_starts + counts[name].itemsize
             element.listed[name] = _gather_lists(values[name], first_values, lengths)
         else:
             element.scalars[name] = values[name][property_starts]
-    return end
 
 
 def _gather_lists(
@@ -323,6 +340,25 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     return _make_parts(reader, points, _parse_texture_names(comments))
 
 
+def _combine_colors(
+    surface: ImportedSurface,
+    colors: Float64Array | None,
+    group: IntArray,
+    notes: Notes,
+) -> tuple[ImportedSurface, Float64Array | None]:
+    """Return the surface of some faces and the colors that tint it.
+
+    A texture has precedence over the colors of vertices and faces.
+    """
+    if colors is None:
+        return surface, None
+    if surface.texture is None:
+        return ImportedSurface(color=np.ones(3, np.float32)), colors
+    if colors[group].min() < 1.0:
+        notes.warn("colours of vertices or faces are left out where there is a texture")
+    return surface, None
+
+
 def _make_parts(
     reader: _Properties, points: Float64Array, texture_names: Sequence[str]
 ) -> list[ImportedPart]:
@@ -349,15 +385,7 @@ def _make_parts(
         has_uvs = np.asarray((uvs.rows >= 0).all(axis=1))
     for group in group_faces(texture, has_uvs):
         surface = surfaces[texture[group[0]]]
-        tint = colors
-        if colors is not None and surface.texture is not None:
-            if colors[group].min() < 1.0:
-                notes.warn(
-                    "colours of vertices or faces are left out where there is a texture"
-                )
-            tint = None
-        elif colors is not None:
-            surface = ImportedSurface(color=np.ones(3, np.float32))
+        surface, tint = _combine_colors(surface, colors, group, notes)
         parts.append(split_at_corners(group, position, normal, uvs, tint, surface))
     return parts
 

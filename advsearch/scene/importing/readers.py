@@ -32,8 +32,8 @@ _READ_AS_GLTF = ("glb", "gltf", "vrm", *_CONVERTERS)
 GLTF_SUFFIXES = tuple(
     f".{name}" for name in _READ_AS_GLTF if name in (*READERS.built_ins, *_CONVERTERS)
 )
-"""Suffixes of glTF files and of files that are converted to it: y is up, and vertex colors
-are linear.
+"""Suffixes of glTF files and of files that are converted to it: y is up, and vertex
+colors are linear.
 """
 
 

@@ -1,8 +1,9 @@
 """Scenes from glTF files: one node as the object, the rest as its surroundings.
 
-``--object scene.glb#chair`` selects the node. Lengths are in object sizes, so everything
-is moved and scaled with the object: its largest extent is 1, it stands on z = 0, and z
-is up. The axis of the file that its format calls the front of an asset is +x.
+``--object scene.glb#chair`` selects the node. Lengths are in object sizes, so
+everything is moved and scaled with the object: its largest extent is 1, it stands on z
+= 0, and z is up. The axis of the file that its format calls the front of an asset is
++x.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -118,37 +119,20 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     node_poses = dict(iterate_poses(header))
     object_nodes = header.find_descendants([_find_node(path, header, parts, node)])
     object_parts = [part for part in parts if part.node in object_nodes]
-    lights = {
-        index: header.lights[light_index]
-        for index in node_poses
-        if (light_index := header.nodes[index].lamp) is not None
-    }
+    lights = _find_node_lights(header, node_poses)
     n_others = len({part.node for part in parts} - object_nodes)
     _check_surroundings(path, n_others + len(lights))
     front = find_front(path, header)
-    turn = compute_rotation("y", front.axis)
-    frame = _compute_frame(object_parts, turn)
+    frame = _compute_frame(object_parts, compute_rotation("y", front.axis))
     names = UniqueNames(RESERVED_NAMES)
-    surroundings: list[ScenePart] = []
-    for index, name in _make_mesh_names(header, parts, names).items():
-        if index not in object_nodes:
-            node_parts = [part for part in parts if part.node == index]
-            part, warnings = _make_surrounding_mesh(
-                path, name, node_parts, front, frame
-            )
-            surroundings.append(part)
-            notes.extend(warnings)
+    surroundings = _make_surrounding_meshes(
+        path, header, parts, object_nodes, names, front, frame, notes
+    )
     candela, reason = _find_light_unit(header, parts, bool(lights))
-    notes.extend([f"{path.name}: {reason}"] if reason else [])
-    for index, light in lights.items():
-        name = names.make_unique(light.name or header.get_label(index))
-        surroundings.append(
-            _make_lamp(path, name, light, candela, node_poses[index], frame)
-        )
-    cameras = {}
-    for index, name in _make_camera_names(header, node_poses).items():
-        camera = header.cameras[header.nodes[index].camera or 0]
-        cameras[name] = _make_camera(path, name, camera, node_poses[index], frame)
+    if reason:
+        notes.append(f"{path.name}: {reason}")
+    surroundings += _make_lamps(path, header, lights, candela, node_poses, names, frame)
+    cameras = _make_cameras(path, header, node_poses, frame)
     notes.extend(gltf_parts.describe_changed_lights(header, path.name))
     asset = make_object(
         object_parts,
@@ -161,10 +145,72 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     return ImportedScene(asset, tuple(surroundings), cameras)
 
 
+def _find_node_lights(header: Header, nodes: Iterable[int]) -> dict[int, LightEntry]:
+    """Return the light of each node that has one."""
+    return {
+        index: header.lights[light_index]
+        for index in nodes
+        if (light_index := header.nodes[index].lamp) is not None
+    }
+
+
+def _make_surrounding_meshes(
+    path: Path,
+    header: Header,
+    parts: Sequence[ImportedPart],
+    object_nodes: Collection[int],
+    names: UniqueNames,
+    front: FileAxis,
+    frame: FileFrame,
+    notes: list[str],
+) -> list[ScenePart]:
+    """Return the meshes of all nodes but those of the object.
+
+    Args:
+        path: the file, for messages.
+        header: of the file.
+        parts: what its nodes draw.
+        object_nodes: the nodes of the object.
+        names: from which the meshes get theirs.
+        front: the axis of the file that is the front.
+        frame: that of the object.
+        notes: warnings are added to it.
+    """
+    meshes: list[ScenePart] = []
+    for index, name in _make_mesh_names(header, parts, names).items():
+        if index not in object_nodes:
+            node_parts = [part for part in parts if part.node == index]
+            mesh, warnings = _make_surrounding_mesh(
+                path, name, node_parts, front, frame
+            )
+            meshes.append(mesh)
+            notes.extend(warnings)
+    return meshes
+
+
+def _make_lamps(
+    path: Path,
+    header: Header,
+    lights: Mapping[int, LightEntry],
+    candela: float,
+    node_poses: Mapping[int, Float64Array],
+    names: UniqueNames,
+    frame: FileFrame,
+) -> list[ScenePart]:
+    """Return the lights of nodes as lamps; arguments and errors as for each."""
+    lamps: list[ScenePart] = []
+    for index, light in lights.items():
+        name = names.make_unique(light.name or header.get_label(index))
+        pose = node_poses[index]
+        lamps.append(_make_lamp(path, name, light, candela, pose, frame))
+    return lamps
+
+
 def _find_node(
     path: Path, header: Header, parts: Sequence[ImportedPart], name: str
 ) -> int:
-    """Return the index of the node of a name that has geometry, or a descendant with it.
+    """Return the index of the node of a name that has geometry, or a descendant with
+    it.
 
     Raises:
         UnknownNameError: there is none.
@@ -268,6 +314,14 @@ class Contents:
     cameras: tuple[str, ...] = ()
 
 
+def _group_by_node(parts: Iterable[ImportedPart]) -> dict[int, list[ImportedPart]]:
+    """Return the parts that each node draws."""
+    parts_of_node: dict[int, list[ImportedPart]] = {}
+    for part in parts:
+        parts_of_node.setdefault(part.node, []).append(part)
+    return parts_of_node
+
+
 @np.errstate(all="ignore")
 def contents(path: Path) -> Contents:
     """Return what can be imported from a mesh or glTF file.
@@ -287,19 +341,17 @@ def contents(path: Path) -> Contents:
     header = gltf.read_header(path, data)
     notes += gltf_parts.describe_changed_lights(header, path.name)
     asset = make_object(parts, notes, path, name, "y", find_front(path, header))
-    parts_of_node: dict[int, list[ImportedPart]] = {}
-    for part in parts:
-        parts_of_node.setdefault(part.node, []).append(part)
+    parts_of_node = _group_by_node(parts)
     mesh_names = _make_mesh_names(header, parts, UniqueNames(RESERVED_NAMES))
     nodes = [
         _measure_node(header.get_label(index), mesh_names[index], parts_of_node[index])
         for index in sorted(parts_of_node)
     ]
-    lights = [
+    lights = tuple(
         light.name or f"light {index}" for index, light in enumerate(header.lights)
-    ]
-    cameras = _make_camera_names(header, dict(iterate_poses(header))).values()
-    return Contents(asset, tuple(nodes), tuple(lights), tuple(cameras))
+    )
+    cameras = tuple(_make_camera_names(header, dict(iterate_poses(header))).values())
+    return Contents(asset, tuple(nodes), lights, cameras)
 
 
 def _measure_node(
@@ -380,6 +432,12 @@ def _find_light_unit(
     )
 
 
+def _normalize_axis(axis: Float64Array) -> tuple[float, float, float]:
+    """Return the unit vector of an axis (3,); zeros for zeros."""
+    x, y, z = map(float, axis / max(float(np.linalg.norm(axis)), 1e-12))
+    return x, y, z
+
+
 def _make_lamp(
     path: Path,
     name: str,
@@ -413,7 +471,8 @@ def _make_lamp(
     is_in_range = np.abs([*position, *intensity]) <= MAX_DISTANCE  # NaN is not
     if not is_in_range.all():
         raise InputError(
-            f"{path}: expected the light {name} within {MAX_DISTANCE:g} object sizes, and "
+            f"{path}: expected the light {name} within {MAX_DISTANCE:g} object sizes, "
+            "and "
             "no brighter than that, got "
             "more; correct its place or its intensity, or remove it"
         )
@@ -424,14 +483,23 @@ def _make_lamp(
     )
     if light.type != "spot":
         return lamp
-    axis = frame.turn @ -pose[:3, 2]
-    axis_x, axis_y, axis_z = map(float, axis / max(float(np.linalg.norm(axis)), 1e-12))
     return SpotLamp(
         **vars(lamp),
-        direction=(axis_x, axis_y, axis_z),
+        direction=_normalize_axis(frame.turn @ -pose[:3, 2]),
         cutoff=math.degrees(light.spot.outerConeAngle),
         beam=math.degrees(light.spot.innerConeAngle),
     )
+
+
+def _make_cameras(
+    path: Path, header: Header, node_poses: Mapping[int, Float64Array], frame: FileFrame
+) -> dict[str, PosedCamera]:
+    """Return the perspective cameras of a file by name; errors as for each."""
+    cameras = {}
+    for index, name in _make_camera_names(header, node_poses).items():
+        camera = header.cameras[header.nodes[index].camera or 0]
+        cameras[name] = _make_camera(path, name, camera, node_poses[index], frame)
+    return cameras
 
 
 def _make_camera(

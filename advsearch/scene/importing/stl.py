@@ -104,8 +104,8 @@ def _read_colors(
 
     Two programs store them with 5 bits for each channel. Magics writes ``COLOR=`` and
     four bytes, the color of the object, into the header; the lowest bits of a facet are
-    red, and its highest bit is not set. VisCAM has blue in the lowest bits, and sets the
-    highest bit of facets with a color.
+    red, and its highest bit is not set. VisCAM has blue in the lowest bits, and sets
+    the highest bit of facets with a color.
 
     Args:
         head: the header of the file.

@@ -1,7 +1,7 @@
 """Texture maps of an imported object, and texture coordinates that fit them.
 
-The file's UVs and textures are used if they can be used unchanged. Otherwise the mesh is
-unwrapped with xatlas, and what the file has (repeating textures, several materials,
+The file's UVs and textures are used if they can be used unchanged. Otherwise the mesh
+is unwrapped with xatlas, and what the file has (repeating textures, several materials,
 vertex colors) is baked into one map each of color, normals and emission.
 """
 
@@ -64,6 +64,14 @@ class SurfaceMaps:
     emission: Float32Array | None = None
 
 
+def _list_used_surfaces(
+    soup: Soup, surfaces: Sequence[ImportedSurface]
+) -> list[ImportedSurface]:
+    """Return the distinct surfaces of parts that have faces."""
+    used_by_id = {id(surfaces[part]): surfaces[part] for part in np.unique(soup.part)}
+    return list(used_by_id.values())
+
+
 def apply_textures(
     soup: Soup, surfaces: Sequence[ImportedSurface], notes: Notes
 ) -> tuple[Soup, SurfaceMaps]:
@@ -76,14 +84,13 @@ def apply_textures(
         surfaces: the surface of each of its parts.
         notes: where it is reported why images were baked.
     """
-    used_by_id = {id(surfaces[part]): surfaces[part] for part in np.unique(soup.part)}
-    used = list(used_by_id.values())
+    used = _list_used_surfaces(soup, surfaces)
     first = used[0]
     is_uniform = all(surface.has_same_maps(first) for surface in used)
-    has_one_factor = bool((soup.colors == soup.colors[0, 0]).all())
-    _, material = index_materials(soup, surfaces)
+    has_uniform_factor = bool((soup.colors == soup.colors[0, 0]).all())
+    material = index_materials(soup, surfaces)[1]
     is_lit_twice = False
-    if is_uniform and has_one_factor:
+    if is_uniform and has_uniform_factor:
         if not first.images:
             return _texture_plain(soup, first, material)
         is_untinted = first.texture is None or soup.colors.min() == 1.0
@@ -102,14 +109,20 @@ def apply_textures(
         "and its texture resampled"
     )
     if not is_lit_twice:
-        reason = _describe_reason(soup, used, is_uniform, has_one_factor)
-    size = len(maps.color)
+        reason = _describe_reason(soup, used, is_uniform, has_uniform_factor)
+    notes.warn(f"{reason} ({_describe_size(len(maps.color), soup, surfaces)})")
+    return unwrapped_soup, maps
+
+
+def _describe_size(size: int, soup: Soup, surfaces: Sequence[ImportedSurface]) -> str:
+    """Describe the size of baked maps, and how much coarser they are than the
+    images.
+    """
     ratio = _count_texels(soup, surfaces) / (size * size * _FILL_FRACTION)
     fewer = ""
     if ratio >= _MAX_TEXEL_RATIO:
         fewer = f", {ratio:.0f} times fewer than its pictures have there"
-    notes.warn(f"{reason} ({size} x {size} texels{fewer})")
-    return unwrapped_soup, maps
+    return f"{size} x {size} texels{fewer}"
 
 
 def _texture_plain(
@@ -197,7 +210,10 @@ def _to_texels(uvs: Float64Array, shape: tuple[int, int]) -> Float64Array:
 
 
 def _describe_reason(
-    soup: Soup, used: Sequence[ImportedSurface], is_uniform: bool, has_one_factor: bool
+    soup: Soup,
+    used: Sequence[ImportedSurface],
+    is_uniform: bool,
+    has_uniform_factor: bool,
 ) -> str:
     """Return the reason why an object was baked, as a sentence for its warnings."""
     if not is_uniform:
@@ -207,7 +223,7 @@ def _describe_reason(
         else:
             baked_things = "the pictures of its material"
         return f"{baked_things} were baked into one texture"
-    if not has_one_factor or soup.colors.min() < 1.0:
+    if not has_uniform_factor or soup.colors.min() < 1.0:
         return "its vertex or face colours were baked into a texture"
     if not np.isfinite(soup.uvs).all():
         substitute = "its normal map is left out"
@@ -299,32 +315,41 @@ def _crop_to_window(
     texel = np.max(
         [1.0 / np.array(picture.shape[1::-1]) for picture in pictures], axis=0
     )
-    low = uvs.min(axis=(0, 1)) - texel
-    high = uvs.max(axis=(0, 1)) + texel
-    size = high - low
+    lower = uvs.min(axis=(0, 1)) - texel
+    upper = uvs.max(axis=(0, 1)) + texel
+    size = upper - lower
     is_inside = (
-        low.min() >= -_UV_TOLERANCE - texel.max()
-        and high.max() <= 1.0 + _UV_TOLERANCE + texel.max()
+        lower.min() >= -_UV_TOLERANCE - texel.max()
+        and upper.max() <= 1.0 + _UV_TOLERANCE + texel.max()
     )
     is_filled = (
         is_inside and np.abs(compute_doubled_areas(uvs)).sum() / 2.0 >= _MIN_UV_AREA
     )
     if size.max() > _MAX_WINDOW or is_filled:
         return uvs, pictures
-    cropped = []
-    for picture in pictures:
-        # Texels keep their size.
+
+    def crop(picture: Float32Array) -> Float32Array:
+        """Return an image of the window; texels keep their size."""
         shape = np.ceil(size * np.array(picture.shape[1::-1]))
         width, height = np.clip(shape, 1, TEXTURE_LIMIT).astype(int)
-        columns = low[0] + (np.arange(width) + 0.5) / width * size[0]
-        rows = high[1] - (np.arange(height) + 0.5) / height * size[1]
+        columns = lower[0] + (np.arange(width) + 0.5) / width * size[0]
+        rows = upper[1] - (np.arange(height) + 0.5) / height * size[1]
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         look_up = sample_colors if picture is colors else sample_texture
-        cropped.append(look_up(picture, grid).reshape(height, width, -1))
-    return (uvs - low) / size, cropped
+        return look_up(picture, grid).reshape(height, width, -1)
+
+    return (uvs - lower) / size, [crop(picture) for picture in pictures]
 
 
 # ---- Baking ----
+
+
+def _choose_size(n_texels: float) -> int:
+    """Return the width of square maps with room for texels, if there may be so many."""
+    size = BAKED_SIZE
+    while size < TEXTURE_LIMIT and size * size * _FILL_FRACTION < n_texels:
+        size *= 2
+    return size
 
 
 def bake(
@@ -343,22 +368,11 @@ def bake(
     Returns:
         Maps (N, N, ...) with room for the texels that the object shows.
     """
-    size = BAKED_SIZE
-    texels = _count_texels(soup, surfaces)
-    while size < TEXTURE_LIMIT and size * size * _FILL_FRACTION < texels:
-        size *= 2
-    pixels = rasterize_triangles(
+    size = _choose_size(_count_texels(soup, surfaces))
+    face, rows, columns, weights = rasterize_triangles(
         _to_texels(uvs, (size, size)), (size, size), tolerance=1e-9
     )
-    face, rows, columns, weights = pixels
-    has_opacity = any(_get_base_color(surface).shape[-1] == 4 for surface in surfaces)
-    color = np.ones((size, size, 3 + has_opacity), np.float32)
-    normals = None
-    if any(surface.normal_map is not None for surface in surfaces):
-        normals = np.full((size, size, 3), FLAT_TEXEL)
-    emission = None
-    if any(surface.emission is not None for surface in surfaces):
-        emission = np.zeros((size, size, 3), np.float32)
+    maps = _make_blank_maps(surfaces, size)
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
     for surface, texel in zip(surfaces, group_indices(soup.part[face]), strict=False):
         if not len(texel):
@@ -367,22 +381,35 @@ def bake(
         x = columns[texel]
         file_uvs = np.einsum("tk,tkc->tc", weights[texel], soup.uvs[face[texel]])
         texel_color = _sample_base_color(surface, file_uvs, soup, surfaces)
-        color[y, x, : texel_color.shape[1]] = _tint(texel_color, factor[texel])
+        maps.color[y, x, : texel_color.shape[1]] = _tint(texel_color, factor[texel])
         if not np.isfinite(file_uvs).all():
             continue
-        if normals is not None and surface.normal_map is not None:
-            normals[y, x] = convert_normals(
+        if maps.normals is not None and surface.normal_map is not None:
+            maps.normals[y, x] = convert_normals(
                 sample_texture(surface.normal_map, file_uvs),
                 soup,
                 uvs,
                 face[texel],
                 weights[texel],
             )
-        if emission is not None and surface.emission is not None:
-            emission[y, x] = sample_texture(surface.emission, file_uvs)
+        if maps.emission is not None and surface.emission is not None:
+            maps.emission[y, x] = sample_texture(surface.emission, file_uvs)
     is_inside = np.zeros((size, size), np.bool_)
     is_inside[rows, columns] = True
-    return _fill_gaps(SurfaceMaps(color, normals, emission), is_inside)
+    return _fill_gaps(maps, is_inside)
+
+
+def _make_blank_maps(surfaces: Sequence[ImportedSurface], size: int) -> SurfaceMaps:
+    """Return white, flat and dark maps (N, N, ...), of which surfaces need some."""
+    has_opacity = any(_get_base_color(surface).shape[-1] == 4 for surface in surfaces)
+    color = np.ones((size, size, 3 + has_opacity), np.float32)
+    normals = None
+    if any(surface.normal_map is not None for surface in surfaces):
+        normals = np.full((size, size, 3), FLAT_TEXEL)
+    emission = None
+    if any(surface.emission is not None for surface in surfaces):
+        emission = np.zeros((size, size, 3), np.float32)
+    return SurfaceMaps(color, normals, emission)
 
 
 def _get_base_color(surface: ImportedSurface) -> Float32Array:
@@ -442,6 +469,17 @@ def _count_texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
     return n_texels
 
 
+def _sample_nearest(texture: Float32Array, uvs: Float64Array) -> Float32Array:
+    """Return the texels (N, C) of a repeating texture that UVs (N, 2) are in."""
+    height, width = texture.shape[:2]
+    rows = (1.0 - uvs[:, 1]) % 1.0 * height
+    columns = uvs[:, 0] % 1.0 * width
+    texels: Float32Array = texture[
+        rows.astype(int) % height, columns.astype(int) % width
+    ]
+    return texels
+
+
 def average_over_faces(
     texture: Float32Array, uvs: Float64Array, areas: Float64Array
 ) -> Float32Array:
@@ -464,14 +502,11 @@ def average_over_faces(
     areas = areas[is_known]
     steps = int(np.clip(np.sqrt(_MAX_SAMPLES / len(areas)), 1, _MAX_STEPS))
     weights = _compute_sample_weights(steps)
-    height, width = texture.shape[:2]
     total = np.zeros(texture.shape[2])
     n_batches = -(-len(areas) * len(weights) // _MAX_SAMPLES)
     for batch in np.array_split(np.arange(len(areas)), n_batches):
         points = np.einsum("pk,fkc->fpc", weights, uvs[batch]).reshape(-1, 2)
-        rows = (1.0 - points[:, 1]) % 1.0 * height
-        columns = points[:, 0] % 1.0 * width
-        texels = texture[rows.astype(int) % height, columns.astype(int) % width]
+        texels = _sample_nearest(texture, points)
         face_means = texels.reshape(len(batch), len(weights), -1).mean(
             axis=1, dtype=np.float64
         )

@@ -104,7 +104,9 @@ class TrackedKeys(Generic[T]):
         return names
 
     def get_spelling(self, key: str) -> str:
-        """Return a key, in folded form, as the file spells it; itself if it is absent."""
+        """Return a key, in folded form, as the file spells it; itself if it is
+        absent.
+        """
         return self._spelling.get(key, key)
 
     def items(self) -> Iterator[tuple[str, T]]:

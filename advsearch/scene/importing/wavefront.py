@@ -7,7 +7,7 @@ may have millions of lines; all other statements are parsed line by line.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
@@ -69,6 +69,58 @@ WRAP_TOLERANCE = 0.01
 NOT_SMOOTH = ("off", "0", "")
 
 
+def _triangulate_faces(
+    tables: Mapping[str, Float64Array],
+    corners: IntArray,
+    corner_counts: IntArray,
+    notes: Notes,
+) -> tuple[IndexedValues, IndexedValues, IndexedValues, IntArray]:
+    """Return points, UVs and normals of the triangles, and the polygon of each.
+
+    Args:
+        tables: the rows of the file's points, UVs and normals.
+        corners: (C, 3) rows in these tables of the corners of all polygons.
+        corner_counts: the number of corners of each polygon.
+        notes: about the file.
+    """
+    points = tables["v"][:, :3]
+    triangles, polygon = triangulate_and_note(
+        points[corners[:, 0]], corner_counts, notes
+    )
+    position = IndexedValues(points, corners[triangles, 0])
+    uv = IndexedValues(tables["vt"], corners[triangles, 1])
+    normal = IndexedValues(tables["vn"], corners[triangles, 2])
+    return position, uv, normal, polygon
+
+
+def _measure_mapped_faces(
+    uv: IndexedValues, position: IndexedValues, is_selected: BoolArray
+) -> tuple[Float64Array, Float64Array]:
+    """Return UVs (F, 3, 2) and doubled areas (F,) of selected faces that have UVs."""
+    is_selected = is_selected & (uv.rows >= 0).all(axis=1)
+    selected_uvs = uv.values[uv.rows[is_selected]]
+    vectors = compute_area_vectors(position.values[position.rows[is_selected]])
+    return selected_uvs, np.linalg.norm(vectors, axis=1)
+
+
+def _transform_uvs(
+    uv: IndexedValues, square: int, painted: MtlSurface
+) -> IndexedValues:
+    """Return UVs relative to their square, as the textures of a material are laid."""
+    corner = mtl_surfaces.get_square_corner(square)
+    uvs = (uv.values - corner) * painted.scale + painted.offset
+    return IndexedValues(uvs, uv.rows)
+
+
+def _note_repetition(uvs: Float64Array, notes: Notes) -> None:
+    """Note that clamped textures repeat here, if UVs reach beyond their edges."""
+    if _reaches_beyond(uvs):
+        notes.warn(
+            " has textures that are not to repeat beyond their edges "
+            "(-clamp); here they do"
+        )
+
+
 def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read an OBJ file and the material files that it names.
 
@@ -82,8 +134,9 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     tables = {kind: lines.read_table(kind) for kind in TABLES}
     if not len(tables["v"]):
         raise notes.damaged(EXPECTED, data)
-    table_sizes = {kind: len(table) for kind, table in tables.items()}
-    corners, corner_counts, face_rows = lines.read_faces(table_sizes)
+    corners, corner_counts, face_rows = lines.read_faces(
+        {kind: len(table) for kind, table in tables.items()}
+    )
     if (corner_counts < 3).all():
         raise FileFormatError(
             f"{path}: expected a mesh with faces, got points or "
@@ -95,26 +148,16 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     ) -> tuple[Float64Array, Float64Array]:
         """Return UVs (F, 3, 2) and doubled areas (F,) of the faces with a material."""
         # Called only after the arrays below exist.
-        is_selected = (
-            (material == names.index(name))
-            & (square == square_number)
-            & (uv.rows >= 0).all(axis=1)
-        )
-        selected_uvs = uv.values[uv.rows[is_selected]]
-        vectors = compute_area_vectors(position.values[position.rows[is_selected]])
-        return selected_uvs, np.linalg.norm(vectors, axis=1)
+        is_selected = (material == names.index(name)) & (square == square_number)
+        return _measure_mapped_faces(uv, position, is_selected)
 
     reader = MtlReader(References(path), notes, find_mapped_faces)
     library_lines, material_changes, smoothing_changes = _parse_statements(lines, notes)
     _read_libraries(reader, library_lines, notes)
 
-    points = tables["v"][:, :3]
-    triangles, polygon = triangulate_and_note(
-        points[corners[:, 0]], corner_counts, notes
+    position, uv, normal, polygon = _triangulate_faces(
+        tables, corners, corner_counts, notes
     )
-    position = IndexedValues(points, corners[triangles, 0])
-    uv = IndexedValues(tables["vt"], corners[triangles, 1])
-    normal = IndexedValues(tables["vn"], corners[triangles, 2])
     rows = face_rows[polygon]
     names, material = _find_values_in_effect(material_changes, rows)
     notes.check_most(len(names), MAX_MATERIALS, "at most {} materials")
@@ -129,27 +172,20 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     for group in group_faces(material, has_uvs, is_flat, square):
         first = group[0]
         name = names[material[first]] if material[first] >= 0 else ""
+        square_number = int(square[first])
         painted = _find_material(
-            reader, name, int(square[first]), colors is not None, bool(library_lines)
+            reader, name, square_number, colors is not None, bool(library_lines)
         )
         surface, tint = _combine_colors(painted.surface, colors, group, notes)
-        corner = mtl_surfaces.get_square_corner(int(square[first]))
-        uvs = (tables["vt"] - corner) * painted.scale + painted.offset
-        if (
-            painted.is_clamped
-            and has_uvs[first]
-            and _reaches_beyond(uvs[uv.rows[group]])
-        ):
-            notes.warn(
-                " has textures that are not to repeat beyond their edges "
-                "(-clamp); here they do"
-            )
+        group_uv = _transform_uvs(uv, square_number, painted)
+        if painted.is_clamped and has_uvs[first]:
+            _note_repetition(group_uv.values[uv.rows[group]], notes)
         parts.append(
             split_at_corners(
                 group,
                 position,
                 normal,
-                IndexedValues(uvs, uv.rows),
+                group_uv,
                 tint,
                 surface,
                 flat=bool(is_flat[first]),
@@ -609,6 +645,23 @@ def _count_words(data: Bytes) -> IntArray:
     return np.asarray(np.add.reduceat(begins_word, line_starts, dtype=np.int64))
 
 
+def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntArray:
+    """Return the column of each number in its corner, by the slashes before it.
+
+    A corner has three numbers at most, so the steps of two predecessors are enough.
+
+    Args:
+        is_first: whether a number is the first of its corner.
+        is_after_two_slashes: whether two slashes, not one, are between a number that is
+            not the first and its predecessor.
+    """
+    step = np.where(is_first, 0, np.where(is_after_two_slashes, 2, 1))
+    column = step.copy()
+    column[1:] += np.where(is_first[1:], 0, step[:-1])
+    column[2:] += np.where(is_first[2:] | is_first[1:-1], 0, step[:-2])
+    return np.asarray(column)
+
+
 def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     """Parse the corners of face lines, such as ``1/2/3 4//5 6``.
 
@@ -621,12 +674,7 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     is_digit = ~(is_blank | is_slash)
     begins = np.flatnonzero(is_digit[1:] & ~is_digit[:-1]) + 1
     is_first = is_blank[begins - 1]
-    # Column of each number in its corner, by the slashes before it. A corner has three
-    # numbers at most, so the steps of two predecessors are enough.
-    step = np.where(is_first, 0, np.where(is_slash[begins - 2], 2, 1))
-    column = step.copy()
-    column[1:] += np.where(is_first[1:], 0, step[:-1])
-    column[2:] += np.where(is_first[2:] | is_first[1:-1], 0, step[:-2])
+    column = _find_columns(is_first, is_slash[begins - 2])
     has_fourth = ~(is_first[3:] | is_first[2:-1] | is_first[1:-2])
     is_malformed = (
         (is_slash[1:] & is_blank[:-1]).any()

@@ -81,7 +81,8 @@ def _get_buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
 
 
 def _compute_gain(radiance: Tensor) -> float:
-    """Return the factor that gives an image the mean logarithmic luminance `KEY_LUMINANCE`.
+    """Return the factor that gives an image the mean logarithmic luminance
+    `KEY_LUMINANCE`.
 
     The denoiser would find it by itself, but adds up in an order that depends on the
     number of threads: by a few units in the last place. The image is (H, W, 3).

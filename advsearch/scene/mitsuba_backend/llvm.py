@@ -202,12 +202,14 @@ def ensure_llvm() -> LibraryFile:
         library = examine_library(path.resolve(), name_hint=path)
     else:
         raise EnvironmentSetupError(
-            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM file, got {variable!r}, which does not "
+            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM file, got {variable!r}, which "
+            "does not "
             f"exist. {advice}"
         )
     if library.refusal:
         raise EnvironmentSetupError(
-            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM of version {MIN_VERSION} or later, got "
+            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM of version {MIN_VERSION} or "
+            "later, got "
             f"{library}. {advice}"
         )
     return replace(library, path=path)
@@ -271,9 +273,11 @@ def select_newest(candidates: list[LibraryFile]) -> LibraryFile:
     command = get_install_command()
     separator = "\n" if "\n" in command else " "
     raise EnvironmentSetupError(
-        f"expected a libLLVM of version {MIN_VERSION} or later, with which Dr.Jit compiles "
+        f"expected a libLLVM of version {MIN_VERSION} or later, with which Dr.Jit "
+        "compiles "
         f"its kernels. {found} "
-        f"Install one with:{separator}{command}{separator}or name a file in {ENVIRONMENT_VARIABLE}."
+        f"Install one with:{separator}{command}{separator}or name a file in "
+        f"{ENVIRONMENT_VARIABLE}."
     )
 
 

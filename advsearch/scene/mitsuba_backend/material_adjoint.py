@@ -310,7 +310,9 @@ def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> 
 def _sample_light(
     view: FilmView, si: Any, sampler: Any, active: Any
 ) -> tuple[Any, Any, Any]:
-    """Sample a direction to an emitter; return it, its weight, and where there is one."""
+    """Sample a direction to an emitter; return it, its weight, and where there is
+    one.
+    """
     is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
     active_em = active & is_smooth
     ds, em_weight = view.scene.sample_emitter_direction(

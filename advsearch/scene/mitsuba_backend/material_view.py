@@ -1,5 +1,5 @@
-"""What the material form of the adjoint needs of a scene: camera, meshes, path tracer and
-random numbers; and its boundary terms.
+"""What the material form of the adjoint needs of a scene: camera, meshes, path tracer
+and random numbers; and its boundary terms.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ _SHADOWS = 3
 
 
 class Camera:
-    """A pinhole camera, from Mitsuba's sensor: its transforms and its size in pixels."""
+    """A pinhole camera, from Mitsuba's sensor: its transforms and its size in
+    pixels.
+    """
 
     def __init__(self, sensor: Any) -> None:
         to_world = sensor.world_transform()
@@ -117,8 +119,8 @@ class FilmView:
     Attributes:
         padded_cotangent: the cotangent with a border of zeros, flat.
         moving_meshes: those that move, in the order of their vertices in `moving`.
-        still_meshes: those that stand still but may hide or shade them; a single rectangle is
-            left out.
+        still_meshes: those that stand still but may hide or shade them; a single
+            rectangle is left out.
     """
 
     def __init__(
@@ -327,8 +329,8 @@ def compute_outline_term(
 ) -> Any:
     """Return a value whose gradient is the outline term of one mesh.
 
-    `mesh_index` is the index of the mesh, `spp` the samples in multiples of the number of
-    pixels.
+    `mesh_index` is the index of the mesh, `spp` the samples in multiples of the number
+    of pixels.
     """
     stream = make_stream(seed, _OUTLINES, mesh_index)
     random = sample_uniform(stream, spp * view.camera.pixels, 1)[:, 0]
@@ -365,6 +367,46 @@ class _OutlineSamples(NamedTuple):
     pixels_per_sample: float  # length of the outline over the number of samples
 
 
+def _to_space_fraction(film_fraction: Tensor, depth: Tensor) -> Tensor:
+    """Return how far along edges in space points are: halfway on the film is not
+    halfway.
+
+    Args:
+        film_fraction: (N,) how far along the edges they are on the film.
+        depth: (N, 2) of both ends.
+    """
+    weighted = film_fraction * depth[:, 0]
+    return weighted / (weighted + (1.0 - film_fraction) * depth[:, 1])
+
+
+def _measure_on_film(camera: Camera, a: Tensor, b: Tensor, depth: Tensor) -> Tensor:
+    """Return the lengths (N,) of edges on the film; 0 outside of it or too near.
+
+    Args:
+        camera: the camera.
+        a, b: (N, 2) ends of the edges on the film.
+        depth: (N, 2) of both ends.
+    """
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+    on_film = (torch.maximum(a, b) > -0.5) & (torch.minimum(a, b) < size + 0.5)
+    is_used = (depth > MIN_DEPTH).all(dim=1) & on_film.all(dim=1)
+    return torch.where(is_used, (b - a).norm(dim=1), 0.0)
+
+
+def _find_film_normals(edge: Tensor, outwards: Tensor) -> Tensor:
+    """Return unit normals (N, 2) of edges on the film that point away from the mesh.
+
+    Args:
+        edge: (N, 2) from end to end on the film.
+        outwards: (N, 2) steps away from the mesh on the film.
+    """
+    normal = torch.nn.functional.normalize(
+        torch.stack([edge[:, 1], -edge[:, 0]], dim=1), dim=1
+    )
+    points_inwards = (normal * outwards).sum(dim=1, keepdim=True) < 0.0
+    return normal * torch.where(points_inwards, -1.0, 1.0)
+
+
 def _sample_outline(
     camera: Camera, mesh: TriMesh, random: Tensor
 ) -> _OutlineSamples | None:
@@ -380,30 +422,17 @@ def _sample_outline(
     a = project_to_film(camera, mesh.vertices[ends[:, 0]])
     b = project_to_film(camera, mesh.vertices[ends[:, 1]])
     depth = (mesh.vertices[ends] - eye) @ forward
-    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-    on_film = (torch.maximum(a, b) > -0.5) & (torch.minimum(a, b) < size + 0.5)
-    is_used = (depth > MIN_DEPTH).all(dim=1) & on_film.all(dim=1)
-    length = torch.where(is_used, (b - a).norm(dim=1), 0.0)
+    length = _measure_on_film(camera, a, b, depth)
     if not float(length.sum()) > 0.0:
         return None
     pick, film_fraction = _sample_along(length, random)
 
-    # The normal on the film, turned so that it points away from the mesh.
-    edge = b[pick] - a[pick]
-    normal = torch.nn.functional.normalize(
-        torch.stack([edge[:, 1], -edge[:, 0]], dim=1), dim=1
-    )
     middle = mesh.vertices[ends].mean(dim=1)
     step = project_to_film(
         camera, middle + 1e-3 * mesh.extent * outwards
     ) - project_to_film(camera, middle)
-    points_inwards = (normal * step[pick]).sum(dim=1, keepdim=True) < 0.0
-    normal = normal * torch.where(points_inwards, -1.0, 1.0)
-
-    # Halfway on the film is not halfway in space.
-    z = depth[pick]
-    weighted = film_fraction * z[:, 0]
-    fraction = weighted / (weighted + (1.0 - film_fraction) * z[:, 1])
+    normal = _find_film_normals(b[pick] - a[pick], step[pick])
+    fraction = _to_space_fraction(film_fraction, depth[pick])
     pixels_per_sample = float(length.sum()) / len(random)
     return _OutlineSamples(ends[pick], fraction, normal, pixels_per_sample)
 
@@ -473,15 +502,17 @@ def compute_shadow_term(
 ) -> Any:
     """Return a value whose gradient is the shadow term of one mesh.
 
-    `mesh_index` is the index of the mesh, `spp` the samples in multiples of the number of
-    pixels.
+    `mesh_index` is the index of the mesh, `spp` the samples in multiples of the number
+    of pixels.
     """
     stream = make_stream(seed, _SHADOWS, mesh_index)
     random = sample_uniform(stream, spp * view.camera.pixels, 4)
     sampled = _sample_tangents(mesh, random)
     if sampled is None:
         return mi.Float(0)
-    ends, fraction, direction = sampled.ends, sampled.fraction, sampled.direction
+    ends = sampled.ends
+    fraction = sampled.fraction
+    direction = sampled.direction
     edge_points = torch.lerp(
         mesh.vertices[ends[:, 0]], mesh.vertices[ends[:, 1]], fraction[:, None]
     )
@@ -575,6 +606,12 @@ class _TangentSamples(NamedTuple):
     measure_per_sample: float  # world units times steradians
 
 
+def _turn_away(vectors: Tensor, directions: Tensor) -> Tensor:
+    """Return vectors (N, 3), turned over where they point in a direction (N, 3)."""
+    points_inwards = (vectors * directions).sum(dim=1, keepdim=True) > 0.0
+    return vectors * torch.where(points_inwards, -1.0, 1.0)
+
+
 def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
     """Sample points on edges and lines through them that touch the mesh there, evenly.
 
@@ -588,9 +625,9 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
     Returns:
         The samples; None if there is nothing to sample.
     """
-    places = mesh.vertices
+    vertices = mesh.vertices
     edges = _measure_exterior_angles(mesh)
-    edge_length = (places[edges.ends[:, 1]] - places[edges.ends[:, 0]]).norm(dim=1)
+    edge_length = (vertices[edges.ends[:, 1]] - vertices[edges.ends[:, 0]]).norm(dim=1)
     measure = edge_length * edges.angle
     if len(random) == 0 or not float(measure.sum()) > 0.0:
         return None
@@ -608,9 +645,7 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
     height = height.abs() - 1.0
     direction = height * axis + (1.0 - height.square()).clamp_min(0.0).sqrt() * aside
 
-    normal = torch.linalg.cross(axis, aside)
-    points_inwards = (normal * (first + second)).sum(dim=1, keepdim=True) > 0.0
-    normal = normal * torch.where(points_inwards, -1.0, 1.0)
+    normal = _turn_away(torch.linalg.cross(axis, aside), first + second)
     return _TangentSamples(
         ends=edges.ends[pick],
         fraction=random[:, 1],
@@ -633,26 +668,40 @@ class _ExteriorAngles(NamedTuple):
 
 
 def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
-    places = mesh.vertices
-    ends, owner, across = _find_edges(places, mesh.corners)
+    vertices = mesh.vertices
+    ends, owner, across = _find_edges(vertices, mesh.corners)
     order = torch.argsort(owner, stable=True)
     n_faces = torch.bincount(owner, minlength=len(ends))
     last = n_faces.cumsum(dim=0) - 1
-    length = (places[ends[:, 1]] - places[ends[:, 0]]).norm(dim=1)
+    length = (vertices[ends[:, 1]] - vertices[ends[:, 0]]).norm(dim=1)
     proper = (n_faces <= 2) & (length > 0.0)
     ends = ends[proper]
     is_single = n_faces[proper] == 1
-    axis = _compute_edge_directions(places, ends)
+    axis = _compute_edge_directions(vertices, ends)
 
     def along_face(entry: Tensor) -> Tensor:
         """Return unit vectors along one of an edge's faces, perpendicular to it."""
-        vector = places[across[order[entry[proper]]]] - places[ends[:, 0]]
+        vector = vertices[across[order[entry[proper]]]] - vertices[ends[:, 0]]
         return torch.nn.functional.normalize(
             vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1
         )
 
     first = along_face(last - n_faces + 1)
     second = along_face(last)
+    turned, angle = _measure_between_faces(first, second, axis, is_single)
+    return _ExteriorAngles(ends, axis, first, second, turned, angle)
+
+
+def _measure_between_faces(
+    first: Tensor, second: Tensor, axis: Tensor, is_single: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the second axis (N, 3) of the exterior angles of edges, and these (N,).
+
+    Args:
+        first, second: (N, 3) unit vectors along both faces, perpendicular to the edge.
+        axis: (N, 3) unit vectors along the edges.
+        is_single: (N,) whether an edge has only one face.
+    """
     cosine = (first * second).sum(dim=1, keepdim=True)
     rest = first - cosine * second
     turned = torch.where(
@@ -661,7 +710,7 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
         -torch.nn.functional.normalize(rest, dim=1),
     )
     angle = torch.pi - torch.atan2(rest.norm(dim=1), cosine[:, 0])
-    return _ExteriorAngles(ends, axis, first, second, turned, angle)
+    return turned, angle
 
 
 def _compute_edge_directions(vertices: Tensor, ends: Tensor) -> Tensor:

@@ -1,4 +1,5 @@
-"""Custom Mitsuba plugins: a path tracer for haze, denoiser guides, a camera with a lens.
+"""Custom Mitsuba plugins: a path tracer for haze, denoiser guides, a camera with a
+lens.
 
 Import this only where a Mitsuba scene is built: it registers the plugins, which needs
 the variant that `variant.mitsuba` sets.
@@ -70,6 +71,21 @@ def sample_raindrops(
     return half_width, drops.astype(np.float32), _find_highest_drops(drops, half_width)
 
 
+def _compute_cap_height(
+    distance_squared: Float64Array, radius: float, curvature_radius: float
+) -> Float64Array:
+    """Return the height of a drop over the sheet: of a cap of a sphere over its cut.
+
+    Args:
+        distance_squared: of points from the middle of the drop.
+        radius: of the drop's circle on the sheet.
+        curvature_radius: of the sphere.
+    """
+    cut_height = math.sqrt(curvature_radius**2 - radius**2)
+    sphere_height = np.sqrt(np.maximum(curvature_radius**2 - distance_squared, 0.0))
+    return np.asarray(sphere_height - cut_height)
+
+
 def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
     """Return the index of the highest drop in each cell, as in `sample_raindrops`."""
     cell_centers = (
@@ -83,12 +99,7 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
         dy = cell_centers[rows] - y
         dx = cell_centers[columns] - x
         distance_squared = dy[:, None] ** 2 + dx[None] ** 2
-
-        # A cap of a sphere: its height over the sphere's cut with the sheet.
-        cut_height = math.sqrt(curvature_radius**2 - radius**2)
-        sphere_height = np.sqrt(np.maximum(curvature_radius**2 - distance_squared, 0.0))
-        height = sphere_height - cut_height
-
+        height = _compute_cap_height(distance_squared, radius, curvature_radius)
         cells = np.ix_(rows, columns)
         is_higher = (distance_squared < radius**2) & (height > highest[cells])
         highest_drop[cells] = np.where(is_higher, index, highest_drop[cells])
@@ -579,8 +590,8 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         """Find the drop at a point of the sheet, in millimetres.
 
         Returns:
-            The drop's four numbers, as in `sample_raindrops`; the point's x and y from the
-            drop's center; and whether there is a drop at all.
+            The drop's four numbers, as in `sample_raindrops`; the point's x and y from
+            the drop's center; and whether there is a drop at all.
         """
         half_width = self._half
         cells_per_mm = GRID_SIZE / (2.0 * half_width)

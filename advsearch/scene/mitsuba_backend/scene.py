@@ -84,8 +84,8 @@ class MitsubaScene:
         description: the scene.
         resolution: (height, width) in pixels.
         filter: reconstruction filter, "box" or "gaussian".
-        leave_out: names from `advsearch.scene.formation.OMISSIONS`; less than everything
-            only to measure what it saves.
+        leave_out: names from `advsearch.scene.formation.OMISSIONS`; less than
+            everything only to measure what it saves.
         max_depth: longest light path in segments.
         sampler: Mitsuba's name of the sampler; some round sample counts up, see
             `round_sample_count`.
@@ -250,7 +250,9 @@ class MitsubaScene:
 
     @contextmanager
     def limit_depth(self, depth: int | None) -> Iterator[None]:
-        """Limit light paths to `depth` segments inside the `with`, if it is not None."""
+        """Limit light paths to `depth` segments inside the `with`, if it is not
+        None.
+        """
         depth_before = self.depth
         self.depth = self.depth if depth is None else min(depth, self.max_depth)
         try:
@@ -536,7 +538,8 @@ class MitsubaScene:
     def collect_paths(
         self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int
     ) -> Paths:
-        """Collect light paths for an input that is a base color or a projector's pattern.
+        """Collect light paths for an input that is a base color or a projector's
+        pattern.
 
         Their vertices have the change of their pixel for a unit more of the input, and
         the paths have an image. Other arguments as for `pictures`.
@@ -663,7 +666,9 @@ class MitsubaScene:
             self.parameters[key] = value
 
     def _integrator(self, method: str) -> Any:
-        """Return the integrator of a method, at the current depth; load it on first use."""
+        """Return the integrator of a method, at the current depth; load it on first
+        use.
+        """
         key = method, self.depth
         if key not in self._integrators:
             path = {

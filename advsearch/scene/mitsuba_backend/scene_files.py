@@ -158,13 +158,15 @@ def read_contents(path: Path) -> PluginContents:
     cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
     known = {*objects, *cameras}
     replaced = INTEGRATOR_TYPES | SENSOR_TYPES
-    kept = {
+    other_kinds = {
         name: kind
         for name, kind in kinds.items()
         if name not in known and kind not in replaced
     }
     lights = tuple(name for name, plugin in named.items() if _emits_light(plugin))
-    return PluginContents(objects, kept, lights, tuple(map(_rename_reserved, cameras)))
+    return PluginContents(
+        objects, other_kinds, lights, tuple(map(_rename_reserved, cameras))
+    )
 
 
 def _rename_reserved(name: str) -> str:
@@ -406,7 +408,8 @@ def _describe_missing_attributes(
         if plugin["type"] == "mesh_attribute" and name not in mesh.attributes:
             available = ", ".join(sorted(mesh.attributes)) or "none"
             yield (
-                f"the mesh has no attribute {format_name(str(name))} (it has {available}), "
+                f"the mesh has no attribute {format_name(str(name))} (it has "
+                f"{available}), "
                 "so that is black"
             )
 
@@ -431,7 +434,8 @@ def _describe_left_out(
         if not isinstance(inner, Mapping):
             if key not in shapes.SHAPE_ENTRIES:
                 yield (
-                    f"the object's {format_name(key)} is left out: a {shape['type']} has none"
+                    f"the object's {format_name(key)} is left out: a {shape['type']} "
+                    "has none"
                 )
             continue
         if inner["type"] in LIGHT_TYPES and not lit:
@@ -514,8 +518,8 @@ class _ObjectFrame:
 
         Args:
             plugin: its dictionary.
-            at_top: it stands at the top of the scene; within another plugin only media and
-                volumes change.
+            at_top: it stands at the top of the scene; within another plugin only media
+                and volumes change.
         """
         kind = plugin["type"]
         if kind in MEDIUM_TYPES:

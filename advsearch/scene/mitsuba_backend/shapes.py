@@ -69,6 +69,23 @@ SHAPE_ENTRIES = MESH_ENTRIES | {
 """The same for any shape."""
 
 
+def _load_any_buffers(shape: Mapping[str, object], name: str) -> Buffers:
+    """Return the buffers of a shape, whether Mitsuba has a mesh of it or not.
+
+    Raises:
+        InputError: the shape has no triangles.
+    """
+    kind = str(shape["type"])
+    if kind not in OBJECT_SHAPES:
+        raise InputError(
+            f"object {name}: a {kind} cannot be moved; expected a shape "
+            f"of {', '.join(OBJECT_SHAPES)}"
+        )
+    if kind in TESSELLATED_SHAPES:
+        return _tessellate(kind, shape, name)
+    return _load_buffers(shape, name)
+
+
 def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]:
     """Return the triangles of a shape in a Mitsuba scene.
 
@@ -88,17 +105,7 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
     Raises:
         InputError: the shape has no triangles, or vertices that are not finite.
     """
-    kind = str(shape["type"])
-    if kind not in OBJECT_SHAPES:
-        raise InputError(
-            f"object {name}: a {kind} cannot be moved; expected a shape "
-            f"of {', '.join(OBJECT_SHAPES)}"
-        )
-    if kind in TESSELLATED_SHAPES:
-        buffers = _tessellate(kind, shape, name)
-    else:
-        buffers = _load_buffers(shape, name)
-    vertices, faces, normals, uvs, attributes = buffers
+    vertices, faces, normals, uvs, attributes = _load_any_buffers(shape, name)
     if not np.isfinite(vertices).all():
         raise InputError(
             f"object {name}: expected finite vertices, got NaN or "
@@ -195,7 +202,9 @@ def _normalize(vectors: Float64Array) -> Float64Array:
 
 
 def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
-    """Make the triangles of one of `TESSELLATED_SHAPES`, with Mitsuba's texture coordinates."""
+    """Make the triangles of one of `TESSELLATED_SHAPES`, with Mitsuba's texture
+    coordinates.
+    """
     local = np.eye(4)
     turn = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)
     normals = None
@@ -310,7 +319,6 @@ def find_haze(
         return None
     ball_name, medium_name = names
     ball = named[ball_name]
-    medium = named[medium_name]
     pose = matrix @ get_pose(ball)
     center = pose @ np.append(
         np.broadcast_to(_parse_numbers(ball.get("center", np.zeros(3))), (3,)), 1.0
@@ -322,6 +330,20 @@ def find_haze(
     ):
         return None
 
+    coefficients = _read_haze_medium(named[medium_name], matrix)
+    if coefficients is None:
+        return None
+    haze = HazePart(ball_name, radius, *coefficients)
+    return haze, frozenset((ball_name, medium_name))
+
+
+def _read_haze_medium(
+    medium: Mapping[str, object], matrix: Float64Array
+) -> tuple[float, tuple[float, float, float]] | None:
+    """Return extinction, in the object's lengths, and albedo of a medium.
+
+    None if it is not grey, or out of range; `matrix` is as in `find_haze`.
+    """
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
     object_size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
@@ -331,8 +353,7 @@ def find_haze(
     if not (is_grey and MIN_ALBEDO <= min(albedo) and max(albedo) <= 1.0):
         return None
     red, green, blue = albedo
-    haze = HazePart(ball_name, radius, float(extinction[0]), (red, green, blue))
-    return haze, frozenset((ball_name, medium_name))
+    return float(extinction[0]), (red, green, blue)
 
 
 def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
@@ -430,7 +451,8 @@ class ShapeSurface:
     # its dictionary, with `{"type": BASE_COLOR}` and how the texture is looked up
     # (`wrap_mode`, `filter_type`) in the place of the base color, if it has one
     plugin: Plugin
-    # (H, W, 3) float32 display-referred, row 0 on top; `DEFAULT_REFLECTANCE` if it has no base color
+    # (H, W, 3) float32 display-referred, row 0 on top; `DEFAULT_REFLECTANCE` if it has
+    # no base color
     base_color: Float32Array
     is_textured: bool  # whether the base color varies over the surface
     # (3, 3) from the mesh's texture coordinates to those of the base color and of
@@ -481,7 +503,9 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
 
 
 def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]:
-    """Return a surface with `BASE_COLOR` in the place of its first base color, and it."""
+    """Return a surface with `BASE_COLOR` in the place of its first base color, and
+    it.
+    """
     base: _Color | None = None
 
     def replace_color(plugin: Mapping[str, object]) -> Plugin:
@@ -599,13 +623,17 @@ def _parse_base_color(value: object) -> _Color | None:
 
 
 def _repeat_texels(texture: Float32Array) -> Float32Array:
-    """Repeat texels so that none is blurred where a control keeps the texture's size."""
+    """Repeat texels so that none is blurred where a control keeps the texture's
+    size.
+    """
     down, across = (-(-MIN_NEAREST_SIZE // size) for size in texture.shape[:2])
     return texture.repeat(down, axis=0).repeat(across, axis=1)
 
 
 def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
-    """Return the linear values (H, W, 3) of a bitmap; None if it cannot be read here."""
+    """Return the linear values (H, W, 3) of a bitmap; None if it cannot be read
+    here.
+    """
     image = value.get("bitmap")
     if isinstance(image, np.ndarray):
         if image.ndim == 2:

@@ -89,12 +89,22 @@ class ViewSamples:
     # (n, H, W, 3) radiance without what the searched texture reflects diffusely
     radiance: Tensor
     coverage: Tensor  # (n, H, W, 1) fraction of each pixel that surfaces cover
-    # (k,) int64, the rays that see the searched texture, ascending; `RAYS_PER_PIXEL` a pixel, row
-    # by row. One that goes through cut-outs sees it several times
+    # (k,) int64, the rays that see the searched texture, ascending; `RAYS_PER_PIXEL` a
+    # pixel, row by row. One that goes through cut-outs sees it several times
     sample: Tensor
     uv: Tensor  # (k, 2) texture coordinates there, as Mitsuba has them
     weight: Tensor  # (k,) the diffuse fraction over pi, and over the rays of a pixel
     is_back: Tensor  # (k,) bool, whether it is seen from behind
+
+
+def _select_ray_offset(ray_index: Any) -> tuple[Any, Any]:
+    """Return where in its pixel each ray goes, in pixels to the right and down."""
+    x_offset = mi.Float(RAY_PATTERN[0][0])
+    y_offset = mi.Float(RAY_PATTERN[0][1])
+    for index, offset in enumerate(RAY_PATTERN[1:], 1):
+        x_offset = dr.select(ray_index == index, offset[0], x_offset)
+        y_offset = dr.select(ray_index == index, offset[1], y_offset)
+    return x_offset, y_offset
 
 
 class ViewTracer:
@@ -268,11 +278,7 @@ class ViewTracer:
         ray_index = lane % RAYS_PER_PIXEL
         view = pixel // (height * width)
         pixel = pixel % (height * width)
-        x_offset = mi.Float(RAY_PATTERN[0][0])
-        y_offset = mi.Float(RAY_PATTERN[0][1])
-        for index, offset in enumerate(RAY_PATTERN[1:], 1):
-            x_offset = dr.select(ray_index == index, offset[0], x_offset)
-            y_offset = dr.select(ray_index == index, offset[1], y_offset)
+        x_offset, y_offset = _select_ray_offset(ray_index)
         camera = [
             dr.gather(mi.Float, cameras, view * CAMERA_SIZE + index)
             for index in range(CAMERA_SIZE)

@@ -108,6 +108,27 @@ def trace_texel_rays(
     return met_cells
 
 
+def _find_sky_cell(
+    scene: MitsubaScene, direction: Any, sky_shape: tuple[int, int]
+) -> Any:
+    """Return the cell of the environment, of rows and columns, that directions meet."""
+    n_rows, n_columns = sky_shape
+    column, row = compute_map_position(direction, world_to_map(scene))
+    sky_column = mi.UInt32(column * n_columns) % n_columns
+    sky_row = mi.UInt32(dr.minimum(row * n_rows, n_rows - 1))
+    return sky_row * n_columns + sky_column
+
+
+def _find_nearest_cell(grid: TexelGrid, si: Any) -> Any:
+    """Return the cell of a grid that is nearest to a hit on its surface."""
+    y, x = compute_grid_position(grid, si.p, si.uv)
+    return mi.Int32(
+        grid.first_cell
+        + _cell_index(y, grid.shape[0]) * grid.shape[1]
+        + _cell_index(x, grid.shape[1])
+    )
+
+
 def _trace_batch(
     scene: MitsubaScene,
     grids: Grids,
@@ -127,11 +148,7 @@ def _trace_batch(
 
     # What escapes meets a cell of the environment.
     n_cells = grids[-1].first_cell + grids[-1].n_cells
-    n_rows, n_columns = sky_shape
-    column, row = compute_map_position(direction, world_to_map(scene))
-    sky_column = mi.UInt32(column * n_columns) % n_columns
-    sky_row = mi.UInt32(dr.minimum(row * n_rows, n_rows - 1))
-    sky_cell = mi.Int32(n_cells + sky_row * n_columns + sky_column)
+    sky_cell = mi.Int32(n_cells + _find_sky_cell(scene, direction, sky_shape))
     met = dr.select(si.is_valid(), mi.Int32(-1), sky_cell)
 
     # What stops meets a texel, or a shape that has no light.
@@ -139,13 +156,7 @@ def _trace_batch(
     for grid, is_hit in zip(grids, masks, strict=True):
         if grid.warp is None and grid.side == 0:
             is_hit &= dr.dot(si.n, direction) < 0.0
-        y, x = compute_grid_position(grid, si.p, si.uv)
-        nearest = mi.Int32(
-            grid.first_cell
-            + _cell_index(y, grid.shape[0]) * grid.shape[1]
-            + _cell_index(x, grid.shape[1])
-        )
-        met = dr.select(is_hit, nearest, met)
+        met = dr.select(is_hit, _find_nearest_cell(grid, si), met)
     return met
 
 

@@ -1,5 +1,5 @@
-"""Collect light transport: how each vertex of a light path changes its pixel when a base
-color changes.
+"""Collect light transport: how each vertex of a light path changes its pixel when a
+base color changes.
 
 One pass traces the paths of an image as the path integrator does (next-event
 estimation and BSDF sampling, weighted by the power heuristic; Veach 1997, section 9.2)
@@ -10,8 +10,8 @@ and stores, for each vertex on a surface whose base color is an input,
 
 so that, to first order, the radiance of the pixel changes by the sum of weight x change
 of the base color at the vertex. The derivative of the BSDF is a difference: the BSDF is
-evaluated once more with all texels `COLOR_STEP` larger. For a base color in which the BSDF is
-affine (the diffuse and the metallic lobe of the principled BSDF) that is exact.
+evaluated once more with all texels `COLOR_STEP` larger. For a base color in which the
+BSDF is affine (the diffuse and the metallic lobe of the principled BSDF) that is exact.
 Dr.Jit's forward mode finds the same, at the price of more kernels. For a projector's
 image, the weight is that of white projected light at the vertex. The whole path is one
 kernel, which also makes the image itself and what guides its denoiser.
@@ -112,9 +112,9 @@ def collect_paths(
     ray, weight = _sample_camera_rays(scene.sensors()[0], noise, size, spp)
     first_hit, emitted, bounces = _trace_paths(scene, ray, weight, noise, depth)
 
-    # The BSDFs are evaluated once more with the base color larger by `COLOR_STEP`: their
-    # differences are the derivatives. For a projector, its light is evaluated alone,
-    # with a white image.
+    # The BSDFs are evaluated once more with the base color larger by `COLOR_STEP`:
+    # their differences are the derivatives. For a projector, its light is evaluated
+    # alone, with a white image.
     texture = mi.TensorXf(parameters[key])
     slopes = [(0.0, 0.0)] * len(bounces)
     projected = list[tuple[Any, Any]]()
@@ -180,6 +180,17 @@ def _accumulate_radiance(
     return L, vertices
 
 
+def _find_weighted_samples(
+    vertices: list[tuple[Any, Any, Any]], n_samples: int
+) -> list[Any]:
+    """Return for each vertex which samples have a weight that is finite and not 0."""
+    every_sample = dr.full(mi.Bool, True, n_samples)
+    return [
+        every_sample & dr.any(weight != 0.0) & dr.all(dr.isfinite(weight))
+        for _, weight, _ in vertices
+    ]
+
+
 def _fetch_paths(
     channels: list[Any],
     vertices: list[tuple[Any, Any, Any]],
@@ -188,11 +199,7 @@ def _fetch_paths(
 ) -> Paths:
     """Evaluate the kernel of a pass and fetch images and vertices into torch."""
     n_samples = size[0] * size[1] * spp
-    every_sample = dr.full(mi.Bool, True, n_samples)
-    has_weight = [
-        every_sample & dr.any(weight != 0.0) & dr.all(dr.isfinite(weight))
-        for _, weight, _ in vertices
-    ]
+    has_weight = _find_weighted_samples(vertices, n_samples)
     dr.eval(channels, vertices, has_weight)  # one kernel for the whole path
     means = [dr.block_sum(channel, spp) / spp for channel in channels]
     dr.eval(means)
@@ -255,8 +262,9 @@ class Bounce:
     def compute_slopes(self) -> tuple[Any, Any]:
         """Return the derivatives of both BSDF values by the base color.
 
-        The base color has to be larger by `COLOR_STEP` now. The first derivative is that of
-        `bsdf_value_em`, the second that of the path's direction over its density.
+        The base color has to be larger by `COLOR_STEP` now. The first derivative is
+        that of `bsdf_value_em`, the second that of the path's direction over its
+        density.
         """
         bsdf_value = self.bsdf_weight * self.bsdf_sample.pdf
         slope_em = self._slope(self.wo_em, self.bsdf_value_em, self.active_em)

@@ -433,7 +433,8 @@ class _FileReader:
         kind = str(plugin["type"])
         if kind not in STOCK_PLUGINS:
             raise FileFormatError(
-                f"{self._path}: {format_name(kind)} is no plugin that comes with Mitsuba; "
+                f"{self._path}: {format_name(kind)} is no plugin that comes with "
+                "Mitsuba; "
                 "leave it out of the file"
             )
         if not re.fullmatch(r"\w*", str(plugin.get("material", ""))):

@@ -252,6 +252,22 @@ def _select_material(
     return primitive.material
 
 
+def _list_posed_meshes(
+    header: Header,
+) -> list[tuple[int, Float64Array]]:
+    """Return the mesh and the pose of each node that shows one, in order of the
+    nodes.
+    """
+    posed_meshes = []
+    for node, pose in sorted(
+        gltf_skeleton.iterate_poses(header), key=lambda item: item[0]
+    ):
+        mesh = header.nodes[node].mesh
+        if mesh is not None:
+            posed_meshes.append((mesh, pose))
+    return posed_meshes
+
+
 def _read_primitives(
     file: GltfFile, variant: int | None, notes: Notes
 ) -> tuple[list[PosedPrimitive], dict[int | None, ImportedSurface]]:
@@ -266,15 +282,9 @@ def _read_primitives(
         The primitives in the pose of each node, and the surface of each material.
     """
     header = file.header
-    posed_meshes = []
-    for node, pose in sorted(
-        gltf_skeleton.iterate_poses(header), key=lambda item: item[0]
-    ):
-        mesh = header.nodes[node].mesh
-        if mesh is not None:
-            posed_meshes.append((mesh, pose))
-    used_meshes = list(dict.fromkeys(mesh for mesh, _ in posed_meshes))
-    pieces = _read_pieces(file, used_meshes, variant)
+    posed_meshes = _list_posed_meshes(header)
+    used_meshes = dict.fromkeys(mesh for mesh, _ in posed_meshes)
+    pieces = _read_pieces(file, list(used_meshes), variant)
     fitted = _fit_surfaces(file, pieces, notes)
     primitives: list[PosedPrimitive] = []
     for mesh, pose in posed_meshes:
@@ -287,8 +297,7 @@ def _read_primitives(
                 primitives.append(
                     PosedPrimitive(primitive.material, piece.material, part)
                 )
-    surfaces = {material: surface for material, (surface, _, _) in fitted.items()}
-    return primitives, surfaces
+    return primitives, {material: fit[0] for material, fit in fitted.items()}
 
 
 def _fit_uvs(

@@ -31,7 +31,9 @@ class _Entry(BaseModel):
 
 
 def _is_convex(corners: Float64Array) -> bool:
-    """Return whether corners (K, 2), in turn, turn to one side only, and hold an area."""
+    """Return whether corners (K, 2), in turn, turn to one side only, and hold an
+    area.
+    """
     edges = np.roll(corners, -1, axis=0) - corners
     turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
         edges[:, 0], -1

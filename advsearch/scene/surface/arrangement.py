@@ -92,8 +92,9 @@ class SurfaceView:
         weights = fractions * samples.weight[begin:end].numpy()[:, None]
         row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
         entries = weights.ravel(), columns.ravel(), row_starts.astype(np.int32)
-        size = height * width, sides * n_cells
-        self.matrix = scipy.sparse.csr_matrix(entries, size, copy=False)
+        self.matrix = scipy.sparse.csr_matrix(
+            entries, (height * width, sides * n_cells), copy=False
+        )
 
     def compute_radiance(self, reflected: Tensor) -> Tensor:
         """Return the radiance (H, W, 3) for what the fine grid reflects.
@@ -205,11 +206,7 @@ class Arrangement:
             reach = self._ground_reach(photograph is not None)
             surfaces.append(texels.make_ground_texels(GROUND_NAME, 0.0, reach, center))
         self.texels: texels.LitTexels = texels.join_texels(surfaces)
-        factor = max(1, math.ceil(MIN_FINE_SIZE / min(texture)))
-        self.fine_shape = texture[0] * factor, texture[1] * factor
-        self._finer = (
-            _make_upsampling_matrix(texture, self.fine_shape) if factor > 1 else None
-        )
+        self._refine(texture)
 
         met_cells = trace_texel_rays(
             scene,
@@ -225,24 +222,18 @@ class Arrangement:
         )
         self._to_fine = []
         for side in range(self.n_sides):
-            side_normals = (1 - 2 * side) * normals
-            buried = self._find_buried(met_cells, side)
             self._to_fine.append(
                 texels.make_lookup_matrix(
                     surfaces[side],
                     charts,
                     self.fine_shape,
                     vertices,
-                    side_normals,
-                    buried,
+                    (1 - 2 * side) * normals,
+                    self._find_buried(met_cells, side),
                 )
             )
         if self._has_ground:
-            ground_cells = met_cells[self.texels.select_grid(self.n_sides)]
-            sees_sky = (ground_cells >= len(self.texels.texel_of_cell)).any(axis=1)
-            self._smooth = texels.make_smoothing_matrix(
-                surfaces[-1], np.asarray(sees_sky)
-            )
+            self._smooth = self._make_ground_smoothing(surfaces[-1], met_cells)
         self.lobes = [self._measure_object()] * self.n_sides
         self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
         self._photographed = None if photograph is None else description.capture_height
@@ -260,6 +251,25 @@ class Arrangement:
             model,
             middle,
         )
+
+    def _refine(self, texture: tuple[int, int]) -> None:
+        """Choose the shape of the fine grid, and how a texture is upsampled to it."""
+        factor = max(1, math.ceil(MIN_FINE_SIZE / min(texture)))
+        self.fine_shape = texture[0] * factor, texture[1] * factor
+        self._finer = None
+        if factor > 1:
+            self._finer = _make_upsampling_matrix(texture, self.fine_shape)
+
+    def _make_ground_smoothing(
+        self, ground: texels.LitTexels, met_cells: Ints
+    ) -> Tensor:
+        """Return the matrix that smooths the light of the ground.
+
+        `met_cells` are the cells (texels, rays) that rays from texels met.
+        """
+        ground_cells = met_cells[self.texels.select_grid(self.n_sides)]
+        sees_sky = (ground_cells >= len(self.texels.texel_of_cell)).any(axis=1)
+        return texels.make_smoothing_matrix(ground, np.asarray(sees_sky))
 
     def _object_buffer(self, buffer: str) -> Float32Array:
         """Return the object's vertices or normals (V, 3)."""
@@ -367,7 +377,9 @@ class Arrangement:
         return SurfaceView(samples, camera_index, self.fine_shape, self.n_sides)
 
     def upsample(self, color: Tensor) -> Tensor:
-        """Return a base color (h, w, 3) on the fine grid, (cells, 3); differentiable."""
+        """Return a base color (h, w, 3) on the fine grid, (cells, 3);
+        differentiable.
+        """
         flat = color.reshape(-1, 3)
         return flat if self._finer is None else multiply_sparse(self._finer, flat)
 
@@ -433,7 +445,9 @@ class Arrangement:
         return self._smooth @ (arriving[ground] / full_light)
 
     def _far_ground(self, leaving: Tensor) -> Tensor:
-        """Return what leaves the ground far off (1, 3): the object hides little there."""
+        """Return what leaves the ground far off (1, 3): the object hides little
+        there.
+        """
         cells = leaving.reshape(*self.texels.grids[-1].shape, 3)
         border = torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]])
         return border.mean(dim=0, keepdim=True).clamp_min(1e-9)

@@ -79,7 +79,8 @@ class MapFingerprint:
 
 
 class SurfaceRenderer(Predictor):
-    """Predict images by light on surfaces, in spaces that `find_refusal` does not refuse.
+    """Predict images by light on surfaces, in spaces that `find_refusal` does not
+    refuse.
 
     An image is linear in the base color of the object. Light that goes from the object
     to itself, or to the ground and back, is that of the base color `base_color`; see
@@ -95,8 +96,8 @@ class SurfaceRenderer(Predictor):
         base_color: (h, w, 3) base color.
         stored_lights: the lights of maps, the oldest first.
         n_dropped: how many lights were removed for others.
-        fixed_light: the light of all images, see `with_fixed_light`; None for that of the image's own
-            environment.
+        fixed_light: the light of all images, see `with_fixed_light`; None for that of
+            the image's own environment.
     """
 
     fixed_light: ArrangementLight | None = None
@@ -197,6 +198,19 @@ class SurfaceRenderer(Predictor):
             self.n_dropped += 1
         return light, torch.ones(3)
 
+    def _choose_light(
+        self, inputs: Mapping[str, Tensor]
+    ) -> tuple[ArrangementLight, Tensor | float]:
+        """Return the light of scene inputs and its factor, or the fixed light."""
+        if self.fixed_light is None:
+            return self.get_light(inputs)
+        return self.fixed_light, 1.0
+
+    def _select_camera_inputs(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the inputs that are the camera's, completed by those of the scene."""
+        names = CAMERA_INPUTS & self._base.keys()
+        return {name: inputs.get(name, self._base[name]) for name in names}
+
     def trace_views(
         self, inputs: Sequence[Mapping[str, Tensor]]
     ) -> Iterator[LitCameraView]:
@@ -205,19 +219,12 @@ class SurfaceRenderer(Predictor):
         Those under one environment are traced in one launch, while the results of the
         launch before are used.
         """
-        lights: list[tuple[ArrangementLight, Tensor | float]] = []
-        for camera_inputs in inputs:
-            if self.fixed_light is None:
-                lights.append(self.get_light(camera_inputs))
-            else:
-                lights.append((self.fixed_light, 1.0))
+        lights = [self._choose_light(camera_inputs) for camera_inputs in inputs]
         cameras_of_light: dict[ArrangementLight, list[int]] = {}
         for number, (light, _) in enumerate(lights):
             cameras_of_light.setdefault(light, []).append(number)
-        names = CAMERA_INPUTS & self._base.keys()
         cameras = [
-            {name: camera_inputs.get(name, self._base[name]) for name in names}
-            for camera_inputs in inputs
+            self._select_camera_inputs(camera_inputs) for camera_inputs in inputs
         ]
         launches = (
             self.arrangement.start_tracing(
@@ -246,8 +253,8 @@ class SurfaceRenderer(Predictor):
             views: of the cameras.
             inputs: scene inputs for each, whose base color is ignored.
             color: (h, w, 3); the images are differentiable in it.
-            full_configurations: full configurations (d,), for what controls do to the finished
-                image.
+            full_configurations: full configurations (d,), for what controls do to the
+                finished image.
         """
         fine = self.arrangement.upsample(color)
         reflected = dict[ArrangementLight, Tensor]()

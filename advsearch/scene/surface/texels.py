@@ -168,6 +168,80 @@ def _find_warp_rate(ratio: float) -> float:
     return lower
 
 
+def _weigh_neighbours(
+    texels: LitTexels,
+    charts: Charts,
+    grid_position: tuple[Float64Array, Float64Array],
+    points: Float32Array,
+    normals: Float32Array,
+    texel_width: float,
+    buried: BoolArray,
+) -> tuple[IntArray, Float64Array]:
+    """Return the texels around points and their weights in a joint bilateral filter.
+
+    Args:
+        texels: of the mesh.
+        charts: of the mesh.
+        grid_position: rows and columns (N,) of the points in the grid of the charts.
+        points: (N, 3) in world space.
+        normals: (N, 3) at the points.
+        texel_width: in world space.
+        buried: (n,) texels that do not count.
+
+    Returns:
+        Indices of texels, -1 outside of the charts, and weights, both (N, neighbours).
+    """
+    y, x = grid_position
+    n_rows, n_columns = charts.is_covered.shape
+    texel_of_position = (
+        np.cumsum(charts.is_covered.ravel()).reshape(n_rows, n_columns) - 1
+    )
+    texel_of_position = np.where(charts.is_covered, texel_of_position, -1)
+
+    def weigh(row: IntArray, column: IntArray, texel: IntArray) -> Float64Array:
+        """Return the weights (N,) of the neighbours at rows and columns."""
+        grid_distance = ((row - y) ** 2 + (column - x) ** 2) / (2.0 * GRID_SIGMA**2)
+        offset = texels.positions[texel] - points
+        distance = (offset**2).sum(axis=1) / (2.0 * (SPACE_SIGMA * texel_width) ** 2)
+        cosine = (texels.normals[texel] * normals).sum(axis=1)
+        similarity = np.clip(cosine, 0.0, 1.0) ** 8
+        weight = np.exp(-grid_distance - distance) * similarity
+        is_used = (texel >= 0) & ~buried[texel]
+        return np.where(is_used, weight, 0.0)
+
+    neighbours = []
+    weights = []
+    for row, column in _iter_neighbourhood(y, x):
+        inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
+        clipped = row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
+        texel = np.where(inside, texel_of_position[clipped], -1)
+        neighbours.append(texel)
+        weights.append(weigh(row, column, texel))
+    return np.stack(neighbours, axis=1), np.stack(weights, axis=1)
+
+
+def _use_nearest_texel(
+    texels: LitTexels,
+    charts: Charts,
+    grid_position: tuple[Float64Array, Float64Array],
+    texel_index: IntArray,
+    weights: Float64Array,
+) -> None:
+    """Give the nearest texel all the weight where no neighbour counts, in place.
+
+    Arguments are those and the results of `_weigh_neighbours`.
+    """
+    y, x = grid_position
+    n_rows, n_columns = charts.is_covered.shape
+    lost = weights.sum(axis=1) < 1e-6
+    nearest_row = np.round(y[lost]).astype(int).clip(0, n_rows - 1)
+    nearest_column = np.round(x[lost]).astype(int).clip(0, n_columns - 1)
+    texel_index[lost, 0] = texels.texel_of_cell[
+        nearest_row * n_columns + nearest_column
+    ]
+    weights[lost, 0] = 1.0
+
+
 def make_lookup_matrix(
     texels: LitTexels,
     charts: Charts,
@@ -200,46 +274,38 @@ def make_lookup_matrix(
     point_normals = normal[rows, columns]
     texel_width = _texel_width(charts, vertices)
     n_rows, n_columns = charts.is_covered.shape
-    y = (rows + 0.5) * n_rows / shape[0] - 0.5
-    x = (columns + 0.5) * n_columns / shape[1] - 0.5
-
-    texel_of_position = (
-        np.cumsum(charts.is_covered.ravel()).reshape(n_rows, n_columns) - 1
+    grid_position = (
+        (rows + 0.5) * n_rows / shape[0] - 0.5,
+        (columns + 0.5) * n_columns / shape[1] - 0.5,
     )
-    texel_of_position = np.where(charts.is_covered, texel_of_position, -1)
-    neighbours = []
-    neighbour_weights = []
-    for row, column in _iter_neighbourhood(y, x):
-        inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
-        clipped = row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
-        texel = np.where(inside, texel_of_position[clipped], -1)
-        grid_distance = ((row - y) ** 2 + (column - x) ** 2) / (2.0 * GRID_SIGMA**2)
-        offset = texels.positions[texel] - points
-        distance = (offset**2).sum(axis=1) / (2.0 * (SPACE_SIGMA * texel_width) ** 2)
-        cosine = (texels.normals[texel] * point_normals).sum(axis=1)
-        similarity = np.clip(cosine, 0.0, 1.0) ** 8
-        weight = np.exp(-grid_distance - distance) * similarity
-        is_used = (texel >= 0) & ~buried[texel]
-        neighbours.append(texel)
-        neighbour_weights.append(np.where(is_used, weight, 0.0))
-    texel_index = np.stack(neighbours, axis=1)
-    weights = np.stack(neighbour_weights, axis=1)
 
-    # Where no neighbour counts, the nearest texel does.
-    lost = weights.sum(axis=1) < 1e-6
-    nearest_row = np.round(y[lost]).astype(int).clip(0, n_rows - 1)
-    nearest_column = np.round(x[lost]).astype(int).clip(0, n_columns - 1)
-    texel_index[lost, 0] = texels.texel_of_cell[
-        nearest_row * n_columns + nearest_column
-    ]
-    weights[lost, 0] = 1.0
+    texel_index, weights = _weigh_neighbours(
+        texels, charts, grid_position, points, point_normals, texel_width, buried
+    )
+    _use_nearest_texel(texels, charts, grid_position, texel_index, weights)
     weights /= weights.sum(axis=1, keepdims=True)
 
+    size = (shape[0] * shape[1], texels.first_texels[1])
+    return _make_sparse(rows * shape[1] + columns, texel_index, weights, size)
+
+
+def _make_sparse(
+    fine_cell: IntArray,
+    texel_index: IntArray,
+    weights: Float64Array,
+    size: tuple[int, int],
+) -> Tensor:
+    """Return a sparse matrix of weights (N, neighbours) that are not negligible.
+
+    Args:
+        fine_cell: (N,) rows of the matrix.
+        texel_index: (N, neighbours) its columns.
+        weights: its entries.
+        size: of the matrix.
+    """
     is_entry = weights > 1e-3
-    fine_cell = (rows * shape[1] + columns)[:, None]
-    cell = np.broadcast_to(fine_cell, texel_index.shape)[is_entry]
+    cell = np.broadcast_to(fine_cell[:, None], texel_index.shape)[is_entry]
     entries = (weights[is_entry].astype(np.float32), (cell, texel_index[is_entry]))
-    size = shape[0] * shape[1], texels.first_texels[1]
     return to_torch_csr(scipy.sparse.coo_matrix(entries, size).tocsr())
 
 
@@ -382,8 +448,8 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     """Sample directions to what is hot by its power, and what comes from each.
 
     A map is looked up between its texels, so that each shines over a tent that reaches
-    its neighbours. Directions are spread over that by `HOT_LATTICE`: a sun of one texel has
-    a soft shadow.
+    its neighbours. Directions are spread over that by `HOT_LATTICE`: a sun of one texel
+    has a soft shadow.
 
     Args:
         radiance: (H, W, 3) of what is hot.
@@ -395,8 +461,9 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     n_rows, n_columns = power.shape
     cumulative = torch.cumsum(power.double().reshape(-1), 0)
     index = torch.arange(HOT_RAYS, dtype=torch.float64)
-    steps = (index + 0.5) / HOT_RAYS * cumulative[-1]
-    texel = torch.searchsorted(cumulative, steps).clamp_max(power.numel() - 1)
+    texel = torch.searchsorted(
+        cumulative, (index + 0.5) / HOT_RAYS * cumulative[-1]
+    ).clamp_max(power.numel() - 1)
     row = texel // n_columns
     column = texel % n_columns
     row_offset = _to_tent((index * HOT_LATTICE[0] % HOT_RAYS + 0.5) / HOT_RAYS)
@@ -404,10 +471,14 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     polar = ((row + row_offset) * (math.pi / (n_rows - 1))).clamp(0.0, math.pi)
     azimuth = (column + 0.5 + column_offset) * (2.0 * math.pi / n_columns)
     solid_angle = math.pi / (n_rows - 1) * 2.0 * math.pi / n_columns
-    color = radiance[row, column]
-    color = color / (color @ LUMINANCE_WEIGHTS)[:, None].clamp_min(1e-12)
     power_per_ray = float(power.sum()) * solid_angle / HOT_RAYS
+    color = _normalize_luminance(radiance[row, column])
     return _to_direction(polar, azimuth, dim=1).float(), color * power_per_ray
+
+
+def _normalize_luminance(color: Tensor) -> Tensor:
+    """Return colors (N, 3) scaled to a luminance of 1; black stays black."""
+    return color / (color @ LUMINANCE_WEIGHTS)[:, None].clamp_min(1e-12)
 
 
 def _to_tent(uniform: Tensor) -> Tensor:
@@ -482,8 +553,8 @@ def compute_irradiance(
     """Return the irradiance (n, 3) of texels.
 
     Args:
-        view_matrices: views of the sky (n, cells) and of each other (n, n), sparse, times the
-            cosine and pi.
+        view_matrices: views of the sky (n, cells) and of each other (n, n), sparse,
+            times the cosine and pi.
         sky: the environment.
         direct: (n, k) cosines towards what is hot where it is visible; None if nothing
             is hot.

@@ -167,7 +167,9 @@ def _measure_effect(
 
 
 def _sample_configurations(group: Group, middle: Tensor) -> Iterator[Tensor]:
-    """Yield configurations in which a group has several values, and others `middle`'s."""
+    """Yield configurations in which a group has several values, and others
+    `middle`'s.
+    """
     fractions = list(PROBE_FRACTIONS)
     if group.options:
         step = -(-group.options // MAX_OPTIONS)
@@ -264,7 +266,9 @@ class BasisMaps:
 
     @cached_property
     def _brightest(self) -> tuple[Tensor, Tensor]:
-        """The brightest texel of the first map in each channel (3, 1), and its value."""
+        """The brightest texel of the first map in each channel (3, 1), and its
+        value.
+        """
         flat = self.maps[0].reshape(-1, 3)
         return flat.argmax(dim=0)[:, None], flat.amax(dim=0)[:, None]
 
@@ -329,7 +333,9 @@ class LightBasis:
             ]
 
     def compute_weights(self, inputs: Inputs) -> Tensor:
-        """Return the weight (lights, 3) of each light in scene inputs; differentiable."""
+        """Return the weight (lights, 3) of each light in scene inputs;
+        differentiable.
+        """
         weights = [torch.ones(1, 3)] if self._still else []
         weights += [inputs[name].reshape(1, 3) for name in self._lamps]
         if self._span is not None:

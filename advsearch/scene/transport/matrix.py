@@ -10,11 +10,11 @@ in the base color,
 
 and J is sparse: a pixel sees few texels directly, in a mirror or through glass
 (bilinear look-ups), and many a little (light from the object to the object), for which
-coarse cells of `CELL_SIZE` x `CELL_SIZE` texels are enough. What a pixel sees of the texels
-hardly depends on the color of the light, so that a row of J is stored as fractions of
-texels, which add up to one, times a color. A matrix that is one of many stores its
-fractions in 16 bits; one that serves a full search stores them in 32, by rows and by
-columns, so that a product with it is one call.
+coarse cells of `CELL_SIZE` x `CELL_SIZE` texels are enough. What a pixel sees of the
+texels hardly depends on the color of the light, so that a row of J is stored as
+fractions of texels, which add up to one, times a color. A matrix that is one of many
+stores its fractions in 16 bits; one that serves a full search stores them in 32, by
+rows and by columns, so that a product with it is one call.
 """
 
 from __future__ import annotations
@@ -522,19 +522,20 @@ def _collect(
 ) -> LinearizedScene:
     """Trace what a `LinearRenderer` needs; arguments as there."""
     non_finite_before = renderer.non_finite
-    inputs = renderer.scene.assembly(renderer.space.inputs(u))
-    applied = {name: value for name, value in inputs.items() if name in IMAGE_INPUTS}
-    traced = {name: value for name, value in inputs.items() if name not in IMAGE_INPUTS}
+    traced = dict(renderer.scene.assembly(renderer.space.inputs(u)))
+    applied = {name: traced.pop(name) for name in list(traced) if name in IMAGE_INPUTS}
     traced |= dict(light)
     linear = find_linear_inputs(renderer) if names is None else names
-    there = {name: value.clone() for name, value in traced.items() if name in linear}
+    linearized_at = {
+        name: value.clone() for name, value in traced.items() if name in linear
+    }
     transports = {
         name: TextureTransport(
             renderer.formation.resolution,
             (value.shape[0], value.shape[1]),
             small=quick,
         )
-        for name, value in there.items()
+        for name, value in linearized_at.items()
     }
     hide = "backdrop.color" in applied
     if not transports:
@@ -551,7 +552,7 @@ def _collect(
             base = torch.cat([base, paths.coverage], dim=-1)
     return LinearizedScene(
         transports=transports,
-        linearized_at=there,
+        linearized_at=linearized_at,
         image_inputs=applied,
         base_image=PackedImage(base, is_small=quick),
         non_finite=renderer.non_finite - non_finite_before,

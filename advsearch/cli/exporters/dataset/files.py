@@ -252,7 +252,9 @@ def find_box(thing: Any) -> tuple[float, float, float, float]:
 def make_things(
     first_id: int, image_id: int, things: list[tuple[Any, int]]
 ) -> list[dict[str, Any]]:
-    """Return the annotations of the things in a picture, with ids from `first_id` on."""
+    """Return the annotations of the things in a picture, with ids from `first_id`
+    on.
+    """
     return [
         make_thing(first_id + index, image_id, thing, category)
         for index, (thing, category) in enumerate(things)

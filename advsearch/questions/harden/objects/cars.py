@@ -64,8 +64,8 @@ def _shell(
     """Create the painted patches of a stack of superellipses.
 
     Args:
-        rows: (R, 4), for each superellipse the fraction of the height, half the width, and
-            x of the front and of the rear end.
+        rows: (R, 4), for each superellipse the fraction of the height, half the width,
+            and x of the front and of the rear end.
         power: of the superellipses.
         middle: x of their center.
         height: returns z from fractions of the height, x and y.
@@ -98,7 +98,9 @@ def _shell(
 
 
 def _outline_angles(rows: Array, power: float, middle: float) -> Array:
-    """Return the angles (C,) of columns that are equally far apart along the widest outline."""
+    """Return the angles (C,) of columns that are equally far apart along the widest
+    outline.
+    """
     # angles are equally far apart along the widest outline, symmetrical, from the
     # rear's middle
     _, half, front, rear = rows[np.argmax(rows[:, 1])]
@@ -111,7 +113,9 @@ def _outline_angles(rows: Array, power: float, middle: float) -> Array:
 def _shell_points(
     rows: Array, power: float, middle: float, height: Height, angle: Array
 ) -> Array:
-    """Return the points (R, C, 3) of a stack of superellipses at the angles of the columns."""
+    """Return the points (R, C, 3) of a stack of superellipses at the angles of the
+    columns.
+    """
     points = np.empty((len(rows), COLUMNS + 1, 3))
     for row, (share, half, front, rear) in zip(points, rows, strict=True):
         x, y = _outline(angle, front, rear, half, power, middle)
@@ -357,7 +361,9 @@ def _wheels() -> list[Patch]:
 
 
 def _tyre_profile(rim: float, half: float) -> list[tuple[float, float]]:
-    """Return the points (r, z) of the profile of a tyre from one side of the rim to the other."""
+    """Return the points (r, z) of the profile of a tyre from one side of the rim to the
+    other.
+    """
     outside = [
         (rim, half - 0.008),
         (rim + 0.012, half),
@@ -486,7 +492,9 @@ def _lacquer(t: Texels, color: Array) -> Array:
 
 
 def _panes(t: Texels) -> Array:
-    """Paint dark glass with the pillar between the doors, and the seats behind the windscreen."""
+    """Paint dark glass with the pillar between the doors, and the seats behind the
+    windscreen.
+    """
     x, y, z = t.xyz.T
     color = mix(
         parse_hex_color("20272b"),

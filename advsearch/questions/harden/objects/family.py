@@ -323,7 +323,9 @@ def _faces_by_material(patches: Sequence[Patch]) -> dict[str, assets.IntArray]:
 def family(
     metres: float, texels: int = DEFAULT_ATLAS_SIZE
 ) -> Callable[[Callable[[ParameterSampler], Instance]], ObjectFamily]:
-    """Decorate a function that makes instances into a family with the function's name."""
+    """Decorate a function that makes instances into a family with the function's
+    name.
+    """
     return lambda make: ObjectFamily(
         make.__name__.replace("_", "-"), make, metres, texels
     )
@@ -335,7 +337,9 @@ def sample_material(
     clearcoat: float = 0.0,
     spread: float = 0.2,
 ) -> assets.Material:
-    """Sample a material with a roughness within `spread`, and sometimes another coat."""
+    """Sample a material with a roughness within `spread`, and sometimes another
+    coat.
+    """
     sampled_roughness = draw(roughness, roughness - spread, roughness + spread)
     sampled_clearcoat = draw(clearcoat, 0.0, 1.0) if draw.chance(0.3) else clearcoat
     metallic = draw(0.0, 0.3, 0.8) if draw.chance(0.06) else 0.0

@@ -1,4 +1,5 @@
-"""Geometric primitives of the bundled objects: patches with a chart of the texture each.
+"""Geometric primitives of the bundled objects: patches with a chart of the texture
+each.
 
 A `Patch` is a piece of mesh with local texture coordinates in [0, 1]^2 and a function
 that says which point of the surface a texture coordinate is, so that textures are
@@ -34,7 +35,9 @@ def normalize(vectors: Array) -> Array:
 
 
 def radius_at_height(profile: Array, height: float) -> float:
-    """Return the radius of a profile (K, 2) of points (r, z), with rising z, at a height."""
+    """Return the radius of a profile (K, 2) of points (r, z), with rising z, at a
+    height.
+    """
     return float(np.interp(height, profile[:, 1], profile[:, 0]))
 
 
@@ -62,7 +65,9 @@ def to_xz_plane(curve: Array) -> Array:
 
 
 def rotation(axis: str, degrees: float) -> Array:
-    """Return the right-handed rotation (3, 3) about the axis "x", "y" or "z", in degrees."""
+    """Return the right-handed rotation (3, 3) about the axis "x", "y" or "z", in
+    degrees.
+    """
     cosine = np.cos(np.radians(degrees))
     sine = np.sin(np.radians(degrees))
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
@@ -72,7 +77,8 @@ def rotation(axis: str, degrees: float) -> Array:
 
 
 def spline(points: Points, count: int) -> Array:
-    """Sample the Catmull-Rom curve through points (K, D) at `count` points, ends included.
+    """Sample the Catmull-Rom curve through points (K, D) at `count` points, ends
+    included.
 
     Its knots are spaced by chord length.
     """
@@ -125,7 +131,9 @@ def round_corners(
 
 
 def subdivide(points: Points, longest: float) -> Array:
-    """Divide the edges of a polyline that are longer than `longest` into equal pieces."""
+    """Divide the edges of a polyline that are longer than `longest` into equal
+    pieces.
+    """
     curve = np.asarray(points, dtype=np.float64)
     parts = [curve[:1]]
     for start, end in pairwise(curve):
@@ -149,7 +157,9 @@ def polygon(sides: int, bevel: float = 0.12, steps: int = 2) -> Array:
 
 
 def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Array:
-    """Return a centered rounded rectangle as a closed counter-clockwise section (M, 2)."""
+    """Return a centered rounded rectangle as a closed counter-clockwise section (M,
+    2).
+    """
     half_width = width / 2
     half_height = height / 2
     corners = [
@@ -164,7 +174,9 @@ def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Arra
 
 
 def ellipse(width: float, height: float, count: int = 20) -> Array:
-    """Return an ellipse with two half-axes as a closed counter-clockwise section (count, 2)."""
+    """Return an ellipse with two half-axes as a closed counter-clockwise section
+    (count, 2).
+    """
     angle = 2 * np.pi * np.arange(count) / count
     return np.stack([width * np.cos(angle), height * np.sin(angle)], axis=1)
 
@@ -203,7 +215,9 @@ def transform_patches(
     rotation: Array | None = None,
     offset: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> list[Patch]:
-    """Rotate patches by a matrix (3, 3), then translate them, with what is painted on them."""
+    """Rotate patches by a matrix (3, 3), then translate them, with what is painted on
+    them.
+    """
     matrix = np.eye(3) if rotation is None else rotation
     translation = np.asarray(offset, dtype=np.float64)
     return [
@@ -286,7 +300,9 @@ def _along(curve: Array) -> tuple[Array, float]:
 
 
 def _fan(count: int) -> assets.IntArray:
-    """Return the faces (count, 3) between vertex 0 and a ring of `count` vertices after it."""
+    """Return the faces (count, 3) between vertex 0 and a ring of `count` vertices after
+    it.
+    """
     j = np.arange(count)
     return np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % count], axis=1).astype(
         np.int64
@@ -316,7 +332,9 @@ def _profile_normals(parts: Sequence[Array]) -> list[Array]:
 
 
 def _around(curve: Array, theta: Array) -> Array:
-    """Rotate a curve (K, 2) of points (r, z) to angles (M,) about the z axis: (K, M, 3)."""
+    """Rotate a curve (K, 2) of points (r, z) to angles (M,) about the z axis: (K, M,
+    3).
+    """
     heights = np.broadcast_to(curve[:, 1:], (len(curve), len(theta)))
     return np.stack(
         [curve[:, :1] * np.cos(theta), curve[:, :1] * np.sin(theta), heights], axis=-1
@@ -514,7 +532,9 @@ def _inner_profile(outside: Array, wall: float) -> tuple[Array, Array]:
 
 
 def _round_lip(outside: Array, wall: float, normal: Array) -> Array:
-    """Return points (5, 2) of a half circle from the outside of a wall to its inside."""
+    """Return points (5, 2) of a half circle from the outside of a wall to its
+    inside.
+    """
     lip_angle = np.pi * np.arange(1, 6) / 6
     lip_center = outside[-1] - wall / 2 * normal[-1]
     lip_across = wall / 2 * normal[-1]
@@ -548,7 +568,8 @@ def sphere(
 
 
 def compute_frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
-    """Return unit tangents and two normals along a path, with as little twist as possible.
+    """Return unit tangents and two normals along a path, with as little twist as
+    possible.
 
     Args:
         path: (N, 3).
@@ -627,7 +648,9 @@ def _sweep_points(
     first_normal: Array,
     second_normal: Array,
 ) -> Array:
-    """Return the points (N, M, 3) of a section that is scaled and moved along a path."""
+    """Return the points (N, M, 3) of a section that is scaled and moved along a
+    path.
+    """
     scaled_section = section[None] * scales[:, None]
     return (
         centres[:, None]
@@ -637,7 +660,9 @@ def _sweep_points(
 
 
 def _sweep_normals(points: Array, tangent: Array) -> Array:
-    """Return the normals (N, M, 3) of a swept surface; along the path where it is a point."""
+    """Return the normals (N, M, 3) of a swept surface; along the path where it is a
+    point.
+    """
     normals = np.cross(
         np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1),
         np.gradient(points, axis=0),
@@ -738,7 +763,9 @@ def box(
 def _face_coordinates(
     bevel: float, steps: int, cells: int, core: Array, i: int, j: int
 ) -> tuple[Array, Array]:
-    """Return coordinates along both axes of a box's face, denser in the rounded edges."""
+    """Return coordinates along both axes of a box's face, denser in the rounded
+    edges.
+    """
     # equal angles
     edges = [
         core[k] + bevel * np.tan(np.linspace(0.0, np.pi / 4, steps + 1)) for k in (i, j)
@@ -789,7 +816,9 @@ def _rounded_face(
 
 
 Field = Callable[[Array], Array]
-"""Maps points (N, 3) to values (N,): about the distance to the edge, positive inside."""
+"""Maps points (N, 3) to values (N,): about the distance to the edge, positive
+inside.
+"""
 SNAP = 0.1
 """Fraction of an edge's length within which a cut is moved to the edge's end.
 
@@ -892,7 +921,9 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
 def _split_faces(
     patch: Patch, value: Array, cut_of_edge: dict[tuple[int, int], int]
 ) -> tuple[list[tuple[int, int, int]], list[bool]]:
-    """Split faces at the cut vertices of their edges, and tell for each whether it is inside."""
+    """Split faces at the cut vertices of their edges, and tell for each whether it is
+    inside.
+    """
     faces: list[tuple[int, int, int]] = []
     is_inside: list[bool] = []
     for face in patch.faces:

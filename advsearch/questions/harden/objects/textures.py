@@ -56,7 +56,9 @@ class ParameterSampler:
         return canonical if self.rng is None else bool(self.rng.random() < probability)
 
     def offset(self) -> Array:
-        """Return an offset (3,) into the noise, so that no two instances have the same clouds."""
+        """Return an offset (3,) into the noise, so that no two instances have the same
+        clouds.
+        """
         return (
             np.array([1.7, 9.2, 5.5])
             if self.rng is None
@@ -122,7 +124,9 @@ def painter(
 
 
 def shade(color: Color, factor: float) -> Color:
-    """Return a darker (factor below 1) or lighter (above 1) color, clipped to [0, 1]."""
+    """Return a darker (factor below 1) or lighter (above 1) color, clipped to [0,
+    1].
+    """
     return np.clip(color * factor, 0.0, 1.0)
 
 
@@ -235,7 +239,9 @@ def rings(
 
 
 def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
-    """Return chart coordinates in cells about `cell` wide, an integer number per chart."""
+    """Return chart coordinates in cells about `cell` wide, an integer number per
+    chart.
+    """
     return t.u * max(1, round(t.size[0] / cell)), t.v * max(1, round(t.size[1] / cell))
 
 
@@ -243,7 +249,9 @@ def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
 def stripes(
     t: Texels, a: Color, b: Color, cell: float, share: float = 0.5, slant: int = 0
 ) -> Array:
-    """Paint stripes up the chart, `cell` apart; they shift by `slant` cells to the top."""
+    """Paint stripes up the chart, `cell` apart; they shift by `slant` cells to the
+    top.
+    """
     across, _ = _cells(t, cell)
     return mix(
         a, b, step(share / 2 - np.abs((across + slant * t.v) % 1.0 - 0.5), 0.0, 0.08)
@@ -295,7 +303,9 @@ def over(t: Texels, base: Paint, mask: Mask, top: Paint) -> Array:
 def between(
     t: Texels, low: float, high: float, axis: int = 2, soft: float = 0.02
 ) -> Array:
-    """Return the mask of texels between two values of a coordinate, with edges `soft` wide."""
+    """Return the mask of texels between two values of a coordinate, with edges `soft`
+    wide.
+    """
     return band_mask(t.xyz[:, axis], low, high, soft)
 
 
@@ -321,7 +331,8 @@ def facing(
 
 
 def sample_paint(draw: ParameterSampler, size: float) -> Paint:
-    """Sample a paint of any kind and colors, for textures that do not indicate the class.
+    """Sample a paint of any kind and colors, for textures that do not indicate the
+    class.
 
     Args:
         draw: with a generator.

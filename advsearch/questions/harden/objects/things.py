@@ -56,7 +56,8 @@ HEXAGONS = shapes.normalize(
 
 
 def football_seams(direction: Array) -> tuple[Array, Array]:
-    """Return the distance (N,) to the nearest seam of a football, and the pentagons' mask.
+    """Return the distance (N,) to the nearest seam of a football, and the pentagons'
+    mask.
 
     The panels are those of a truncated icosahedron.
     """
@@ -549,7 +550,9 @@ FINISHES = {
 
 @painter
 def _face(t: Texels, red: Array, radius: float) -> Array:
-    """Paint the word in white on red, with a white rim, on an octagon before it is raised."""
+    """Paint the word in white on red, with a white rim, on an octagon before it is
+    raised.
+    """
     inner = radius * np.cos(np.pi / 8)
     turns = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
     y = t.xyz[:, 1]

@@ -235,7 +235,9 @@ def _hammer_paints(
 def _weights(
     draw: ParameterSampler, style: str, at: float, length: float, radius: float
 ) -> list[Patch]:
-    """Create the weight on the +x end of the bar, built along z and rotated afterwards."""
+    """Create the weight on the +x end of the bar, built along z and rotated
+    afterwards.
+    """
     if style == "hex":
         path = [
             (0, 0, at),

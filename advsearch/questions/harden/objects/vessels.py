@@ -1,4 +1,6 @@
-"""Open containers of revolution: mug, bowl, bottle, vase, wine glass; in centimeters."""
+"""Open containers of revolution: mug, bowl, bottle, vase, wine glass; in
+centimeters.
+"""
 
 from __future__ import annotations
 
@@ -180,7 +182,9 @@ def mug(draw: ParameterSampler) -> Instance:
 def _mug_body(
     draw: ParameterSampler, height: float
 ) -> tuple[float, Array, list[Patch]]:
-    """Create a mug without its handle; also return its wall's thickness and its side's profile."""
+    """Create a mug without its handle; also return its wall's thickness and its side's
+    profile.
+    """
     top = draw(4.15, 3.6, 5.0)
     foot = top * draw(0.93, 0.72, 1.02)
     belly = draw(0.0, -0.06, 0.13) * top
@@ -458,7 +462,9 @@ def vase(draw: ParameterSampler) -> Instance:
 def _vase_body(
     draw: ParameterSampler, height: float
 ) -> tuple[float, float, Array, list[Patch]]:
-    """Create a vase without handles; also return the heights of belly and neck, and its profile."""
+    """Create a vase without handles; also return the heights of belly and neck, and its
+    profile.
+    """
     foot = draw(3.6, 2.6, 4.4)
     belly = draw(7.2, 5.2, 8.6)
     belly_at = height * draw(0.52, 0.3, 0.68)
@@ -552,7 +558,9 @@ def wine_glass(draw: ParameterSampler) -> Instance:
 def _glass_bowl(
     draw: ParameterSampler, stem: float, stem_top: float
 ) -> tuple[float, float, Array]:
-    """Return the depth of a glass's bowl, the thickness of its wall, and its outer profile."""
+    """Return the depth of a glass's bowl, the thickness of its wall, and its outer
+    profile.
+    """
     bowl = draw(4.1, 3.2, 5.0)
     deep = draw(9.8, 6.5, 11.5)
     mouth = bowl * draw(0.8, 0.7, 1.12)

@@ -156,6 +156,14 @@ def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
     filtered = rows[:, 1:].reshape(height, width, pixel_size)
     unfiltered = np.ascontiguousarray(_unfilter(rows[:, 0], filtered))
     values = unfiltered.view(">u2").astype(np.float32) / np.float32(65535.0)
+    return _expand_to_rgba(values)
+
+
+def _expand_to_rgba(values: Array) -> Array:
+    """Return values (H, W, 4) of an image with 1 to 4 channels: grey or color,
+    alpha.
+    """
+    (height, width, channels) = values.shape
     alpha = np.ones((height, width, 1), np.float32)
     if channels in (2, 4):
         alpha = values[:, :, channels - 1 :]

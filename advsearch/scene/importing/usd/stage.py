@@ -1,8 +1,8 @@
 """Converter of OpenUSD stages to binary glTF, with `usd-core`.
 
 This module runs in a separate process. Layers are checked before they are composed: all
-that they name has to be a layer in the folder of the first one or below. What our reader
-of glTF cannot represent is named in `asset.extras` of the file.
+that they name has to be a layer in the folder of the first one or below. What our
+reader of glTF cannot represent is named in `asset.extras` of the file.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -348,6 +348,36 @@ class Conversion:
         if rest_matrix is not None:
             node["moved"] = rest_matrix.ravel().tolist()
         triangles, face = self._triangulate(mesh, points, counts, corners)
+        primitives = self._make_primitives(
+            prim, mesh, points, counts, corners, triangles, face
+        )
+        if primitives:
+            node["mesh"] = len(self.header["meshes"])
+            self.header["meshes"].append(
+                {"name": node["name"], "primitives": primitives}
+            )
+
+    def _make_primitives(
+        self,
+        prim: Any,
+        mesh: Any,
+        points: Array,
+        counts: Array,
+        corners: Array,
+        triangles: Array,
+        face: Array,
+    ) -> list[dict[str, Any]]:
+        """Return one primitive for each material and tint of a mesh.
+
+        Args:
+            prim: of the mesh.
+            mesh: the mesh.
+            points: (N, 3).
+            counts: the number of corners of each face.
+            corners: the points of the corners of all faces.
+            triangles: (T, 3) rows of `corners`.
+            face: (T,) of each triangle.
+        """
         primvars = UsdGeom.PrimvarsAPI(prim)
         normals = self._read_normals(mesh, primvars, points, corners[triangles])
         primitives = []
@@ -359,12 +389,11 @@ class Conversion:
                 corner_rows = triangles[is_selected].reshape(-1)
                 if not len(corner_rows):
                     continue
-                attributes: dict[str, tuple[Array, str] | None] = {
+                attributes = {
                     "NORMAL": normals,
                     "COLOR_0": colors,
+                    **self._read_layouts(primvars, bound.layouts),
                 }
-                for index, layout in enumerate(bound.layouts):
-                    attributes[f"TEXCOORD_{index}"] = self._read_uvs(primvars, layout)
                 entry = self._make_primitive(
                     str(prim.GetPath()),
                     points,
@@ -374,11 +403,7 @@ class Conversion:
                     attributes,
                 )
                 primitives.append({**entry, "material": material})
-        if primitives:
-            node["mesh"] = len(self.header["meshes"])
-            self.header["meshes"].append(
-                {"name": node["name"], "primitives": primitives}
-            )
+        return primitives
 
     def _check_corners(
         self, prim: Any, n_points: int, counts: Array, corners: Array
@@ -515,6 +540,17 @@ class Conversion:
         transformed = layout.transform(st)
         uvs = np.stack([transformed[:, 0], 1.0 - transformed[:, 1]], axis=1)
         return uvs, interpolation
+
+    def _read_layouts(
+        self, primvars: Any, layouts: Iterable[TextureLayout]
+    ) -> dict[str, tuple[Array, str] | None]:
+        """Return the texture coordinates of layouts, by the names that glTF has for
+        them.
+        """
+        return {
+            f"TEXCOORD_{index}": self._read_uvs(primvars, layout)
+            for index, layout in enumerate(layouts)
+        }
 
     def _split_by_tint(
         self,

@@ -85,7 +85,9 @@ class TextureLayout:
 
 @dataclass(frozen=True)
 class PrimvarUse:
-    """A primvar that replaces a number or a color, and the fallback if it is missing."""
+    """A primvar that replaces a number or a color, and the fallback if it is
+    missing.
+    """
 
     name: str
     fallback: tuple[float, ...]
@@ -287,7 +289,8 @@ class UsdSurfaces:
     # ---- Images ----
 
     def load_image(self, asset: Any, name: str) -> bytes | None:
-        """Return the bytes of an image in the folder; None, and a note, if it is missing.
+        """Return the bytes of an image in the folder; None, and a note, if it is
+        missing.
 
         Args:
             asset: the asset path.
@@ -334,7 +337,8 @@ class UsdSurfaces:
                 errors.FileFormatError,
             ) as error:
                 self.note(
-                    f"the texture {use.path[:100]!r} cannot be read ({format_error(error)})"
+                    f"the texture {use.path[:100]!r} cannot be read "
+                    f"({format_error(error)})"
                 )
                 return None
         return self._texels[key]
@@ -376,6 +380,13 @@ class UsdSurfaces:
         if entry not in entries:
             entries.append(entry)
         return entries.index(entry)
+
+
+def _read_fallback(node: Shader) -> tuple[float, ...] | None:
+    """Return the color that stands in for a missing image; None if there is none."""
+    if node.get_value("fallback") is None:
+        return None
+    return node.get_numbers("fallback", NO_SCALE)
 
 
 @dataclass
@@ -471,25 +482,33 @@ class PreviewSurface:
         primvar = str(reader.get_value("varname") or "")
         return PrimvarUse(primvar, reader.get_numbers("fallback", [0.0] * len(default)))
 
+    def _is_srgb(self, color_space: str, data: bytes) -> bool:
+        """Return whether an image is in sRGB, by the shader or else by the image."""
+        if color_space not in ("auto", "raw", "sRGB"):
+            self.surfaces.note(
+                f"has a texture with the sourceColorSpace {color_space[:50]!r}, which "
+                "is taken for auto"
+            )
+        if color_space in ("raw", "sRGB"):
+            return color_space == "sRGB"
+        return is_marked_srgb(data)
+
     def _find_texture(self, name: str) -> UsdTextureUse | tuple[float, ...] | None:
         """Return the texture that an input is connected to.
 
         Returns:
-            The texture; or the numbers, one for each channel, that stand in for an image
-            that is missing; or None.
+            The texture; or the numbers, one for each channel, that stand in for an
+            image that is missing; or None.
         """
         source = self.shader.find_source(name)
         if source is None:
             return None
         node = self._track_shader(source[0])
         output = source[1]
-        leave = self.surfaces.note
         if node.kind != UV_TEXTURE:
-            leave(f"has a {name} of {node.kind[:100]}, which is left out")
+            self.surfaces.note(f"has a {name} of {node.kind[:100]}, which is left out")
             return None
-        fallback = None
-        if node.get_value("fallback") is not None:
-            fallback = node.get_numbers("fallback", NO_SCALE)
+        fallback = _read_fallback(node)
         scale = node.get_numbers("scale", NO_SCALE)
         bias = node.get_numbers("bias", NO_BIAS)
         layout = self._find_layout(node)
@@ -497,7 +516,7 @@ class PreviewSurface:
         color_space = str(node.get_value("sourceColorSpace") or "auto")
         asset = node.get_value("file")
         if output not in CHANNELS:
-            leave(
+            self.surfaces.note(
                 f"has a {name} of the output {output[:50]!r} of a picture, which is "
                 "left out"
             )
@@ -510,20 +529,25 @@ class PreviewSurface:
                 return None
             return tuple(fallback[channel] for channel in channels)
         if channels == CHANNELS["a"] and data.startswith(EXR):
-            leave(f"has a {name} of the alpha of an .exr picture, which is left out")
-            return None
-        if color_space not in ("auto", "raw", "sRGB"):
-            leave(
-                f"has a texture with the sourceColorSpace {color_space[:50]!r}, which "
-                "is taken for auto"
+            self.surfaces.note(
+                f"has a {name} of the alpha of an .exr picture, which is left out"
             )
-        is_srgb = color_space == "sRGB"
-        if not is_srgb and color_space != "raw":
-            is_srgb = is_marked_srgb(data)
-        return UsdTextureUse(path, data, is_srgb, channels, scale, bias, layout, wraps)
+            return None
+        return UsdTextureUse(
+            path,
+            data,
+            self._is_srgb(color_space, data),
+            channels,
+            scale,
+            bias,
+            layout,
+            wraps,
+        )
 
     def _load_image(self, asset: Any, path: str, name: str) -> bytes | None:
-        """Return the bytes of the image of an input; None, and a note, if there is none."""
+        """Return the bytes of the image of an input; None, and a note, if there is
+        none.
+        """
         if "<UDIM>" in path:
             self.surfaces.note(
                 "has UDIM textures, which are left out; make .obj or one texture of "
@@ -858,7 +882,9 @@ def _pack_planes(planes: Mapping[str, Array], factors: Mapping[str, float]) -> A
 
 
 def _compute_transform(node: Shader) -> Array:
-    """Return the matrix (3, 3) of a UsdTransform2d: scale, then rotate, then translate."""
+    """Return the matrix (3, 3) of a UsdTransform2d: scale, then rotate, then
+    translate.
+    """
     scale = node.get_numbers("scale", (1.0, 1.0))
     shift = node.get_numbers("translation", (0.0, 0.0))
     angle = math.radians(node.get_number("rotation", 0.0))
