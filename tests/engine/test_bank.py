@@ -54,12 +54,6 @@ def grow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let it compare every six evaluations, and go on growing after each comparison."""
     sizes = {"COMPARISON_INTERVAL": 6, "N_COMPARED": 2, "INITIAL_CONDITIONS": 3, "DRAWS_PER_CONDITION": 4}
     for name, value in {**sizes, "MIN_STANDARD_ERRORS": -1e9}.items():
-        "COMPARISON_INTERVAL": 6,
-        "N_COMPARED": 2,
-        "MIN_STANDARD_ERRORS": -1e9,
-        "INITIAL_CONDITIONS": 3,
-        "DRAWS_PER_CONDITION": 4,
-    }.items():
         monkeypatch.setattr(bank, name, value)
     monkeypatch.setattr(acceptance, "CHECK_SPP", 4)
     monkeypatch.setattr(surface_renderer, "find_refusal", lambda renderer, varying: Refusal("matrices are tested"))
