@@ -37,14 +37,14 @@ import os, signal, sys
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.scene.renderer import Renderer
-whole, pictures, last = Renderer.finished, 0, int(sys.argv[1])
+whole, pictures, last = Renderer.finish_image, 0, int(sys.argv[1])
 def view(self, *words, **more):
     global pictures
     pictures += 1
     if pictures == last:
         os.kill(os.getpid(), signal.SIGKILL)
     return whole(self, *words, **more)
-Renderer.finished = view
+Renderer.finish_image = view
 sys.exit(main(sys.argv[2:]))
 """
 

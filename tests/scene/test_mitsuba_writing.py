@@ -48,10 +48,10 @@ from pathlib import Path
 import numpy as np
 from advsearch import threads
 from advsearch.scene.mitsuba_backend.writing import write_xml
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 threads.configure(1)
 values = np.linspace(0, 2, 8 * 16 * 4, dtype=np.float32).reshape(8, 16, 4)
-bitmaps = {f"picture-{n}": mitsuba().Bitmap(values[..., :n]) for n in (1, 3, 4)}
+bitmaps = {f"picture-{n}": import_mitsuba().Bitmap(values[..., :n]) for n in (1, 3, 4)}
 pictures = {name: {"type": "bitmap", "bitmap": bitmap, "raw": True} for name, bitmap in bitmaps.items()}
 write_xml(Path(sys.argv[1]), {"type": "scene", **pictures}, {}, "")
 """

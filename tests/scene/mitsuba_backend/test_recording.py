@@ -15,11 +15,11 @@ from advsearch.scene.mitsuba_backend.variant import import_mitsuba, record_on_fi
 COLLECTED_IN_A_RECORDING = """
 import gc, weakref
 import torch
-from advsearch.scene.description import describe
+from advsearch.scene.description import load_description
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 
-mitsuba()
+import_mitsuba()
 import drjit
 
 freeze, seen = drjit.freeze, []
@@ -34,18 +34,18 @@ def greedy_freeze(function, **options):
     return freeze(greedy, **options)
 
 gc.set_threshold(10**9)
-dropped, other = (MitsubaScene(describe("mug", "studio"), (8, 8)) for _ in range(2))
+dropped, other = (MitsubaScene(load_description("mug", "studio"), (8, 8)) for _ in range(2))
 for scene in (dropped, other):
-    scene.radiance({"object.vertices": scene.base("object.vertices") + 0.1}, seed=1, spp=1)
+    scene.render_radiance({"object.vertices": scene.get_base_value("object.vertices") + 0.1}, seed=1, spp=1)
 gone = weakref.ref(dropped)
 dropped.itself = dropped
 del dropped, scene
 drjit.freeze = greedy_freeze
-before = other.radiance({}, seed=2, spp=4)
+before = other.render_radiance({}, seed=2, spp=4)
 assert seen == [True] and gc.isenabled(), "it is there while another is recorded"
 gc.collect()
 assert gone() is None, "and goes after"
-assert torch.equal(other.radiance({}, seed=2, spp=4), before)
+assert torch.equal(other.render_radiance({}, seed=2, spp=4), before)
 """
 """A scene is held by nothing but a cycle when another one is recorded."""
 
