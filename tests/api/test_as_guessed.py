@@ -486,9 +486,9 @@ def test_a_notebook_shows_pictures(scene: advsearch.Scene, model: advsearch.Mode
 def test_help_fits_a_screen_before_the_settings(name: str) -> None:
     thing = getattr(advsearch, name)
     text = pydoc.plain(pydoc.render_doc(thing))
-    lines = [part for line in text.splitlines() for part in (re.findall(".{1,120}", line) or [""])]
+    lines = [part for line in text.splitlines() for part in (re.findall(".{1,88}", line) or [""])]
     settings = [k for k, line in enumerate(lines) if re.match(r" +(environment|seed|confirm|case|quick): ", line)]
-    assert (settings[0] if settings else len(lines)) <= 42, "lines of 120 characters"
+    assert (settings[0] if settings else len(lines)) <= 56, "lines of 88 characters"
 
 
 def test_an_editable_install_is_a_path_that_type_checkers_follow() -> None:

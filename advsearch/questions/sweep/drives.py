@@ -126,7 +126,7 @@ def compute_distance_bounds(job: Job, axis: Axis) -> tuple[float, float] | None:
             )
             if control is None or not control.travels:
                 return None
-            distances = control.distances(times)
+            distances = control.compute_distances(times)
             lowest = min(lowest, float(distances.min()))
             highest = max(highest, float(distances.max()))
     return lowest, highest
