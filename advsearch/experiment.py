@@ -41,7 +41,7 @@ ResultType = TypeVar("ResultType", bound=Result)
 SHARED_RESULT_FIELDS = {
     "object": "object",
     "objects": "objects",
-    "environment": "lit_by",
+    "environment": "environment_name",
     "controls": "controls",
     "model": "model",
     "task": "task_name",

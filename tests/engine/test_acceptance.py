@@ -111,10 +111,10 @@ def test_a_small_object_that_is_too_bright_is_refused() -> None:
     """Over the whole picture it would be less than two levels off."""
     found, predicted = seen(brighter)
     whole = 255.0 * float((predicted - Tracer().picture).square().mean().sqrt())
-    assert whole < 3.0 and found.levels > 25.0 and not found.good
+    assert whole < 3.0 and found.levels > 25.0 and not found.is_accepted
     assert "levels of 255 off on the object" in found.reason
     right, _ = seen(lambda tracer, picture: picture)
-    assert right.good and right.levels < MIN_ALLOWED_LEVELS
+    assert right.is_accepted and right.levels < MIN_ALLOWED_LEVELS
 
 
 def test_a_bias_of_the_margin_is_refused_where_the_picture_is_near_enough() -> None:
@@ -122,7 +122,7 @@ def test_a_bias_of_the_margin_is_refused_where_the_picture_is_near_enough() -> N
         return 100.0 * float(picture[..., 0].mean())
 
     found, _ = seen(lambda tracer, picture: picture + 0.005, model)
-    assert found.levels < MIN_ALLOWED_LEVELS and found.logits == pytest.approx(0.5, abs=1e-3) and not found.good
+    assert found.levels < MIN_ALLOWED_LEVELS and found.logits == pytest.approx(0.5, abs=1e-3) and not found.is_accepted
     assert found.reason == "+0.50 off in the margin, where 0.30 would do"
 
 
