@@ -195,9 +195,9 @@ class StandInWorkers:
     made: InProcess
     lost: tuple[int, ...] = ()
     given: list[int] = field(default_factory=list)
-    facts: WorkerStats | None = field(default_factory=lambda: WorkerStats(workers=2, most=2, busy=1.0, alive=2.0))
+    stats: WorkerStats | None = field(default_factory=lambda: WorkerStats(workers=2, most=2, busy=1.0, alive=2.0))
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
+    def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         """The latest comes first."""
         first, listed = len(self.given), list(batches)
         for place, done in enumerate(self.made.compute(reversed(listed))):

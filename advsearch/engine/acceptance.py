@@ -65,14 +65,14 @@ class Deviation:
 
     Attributes:
         levels: root mean square over the object, in levels of 255.
-        margin_bias: mean difference of the margin.
+        logits: mean difference of the margin.
         allowed_levels: levels that are allowed.
         n_traced: images that were traced to measure it.
         allowed_margin_bias: difference of the margin that is allowed.
     """
 
     levels: float
-    margin_bias: float
+    logits: float
     allowed_levels: float
     n_traced: int
     allowed_margin_bias: float = MAX_MARGIN_BIAS
@@ -86,7 +86,7 @@ class Deviation:
         moved = statistics.fmean(view.margin_change for view in views)
         return cls(
             levels=_root(square),
-            margin_bias=logits,
+            logits=logits,
             allowed_levels=max(MIN_ALLOWED_LEVELS, _root(allowed)),
             n_traced=sum(view.n_traced for view in views),
             allowed_margin_bias=max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * moved),
@@ -104,7 +104,7 @@ class Deviation:
         """Whether predictions may replace rendered images; False if anything is NaN."""
         return (
             self.levels_fraction <= ACCEPTED_FRACTION
-            and abs(self.margin_bias) <= self.allowed_margin_bias
+            and abs(self.logits) <= self.allowed_margin_bias
         )
 
     @property
@@ -116,7 +116,7 @@ class Deviation:
                 f"{ACCEPTED_FRACTION * self.allowed_levels:.1f} would do"
             )
         return (
-            f"{self.margin_bias:+.2f} off in the margin, where "
+            f"{self.logits:+.2f} off in the margin, where "
             f"{self.allowed_margin_bias:.2f} would do"
         )
 
@@ -130,7 +130,7 @@ def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
     first = Deviation.from_views(views)
     margin_limit = CLEARLY_GOOD * first.allowed_margin_bias
     is_good = (
-        first.levels_fraction <= CLEARLY_GOOD and abs(first.margin_bias) <= margin_limit
+        first.levels_fraction <= CLEARLY_GOOD and abs(first.logits) <= margin_limit
     )
     if not is_good and first.levels_fraction < CLEARLY_BAD:
         views += [compare_view(index) for index in range(N_FIRST_VIEWS, N_VIEWS)]

@@ -37,7 +37,7 @@ SMALL = AttackConfig(
 class Backwards:
     """Carries out the last range first, in this process; `lost` says of what it dies."""
 
-    facts = WorkerStats(workers=1)
+    stats = WorkerStats(workers=1)
 
     def __init__(self, work: WorkerTask, lost: str) -> None:
         self.call, self.lost = parts.attacks_of(work.settings), lost

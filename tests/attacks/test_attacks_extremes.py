@@ -181,7 +181,7 @@ def test_what_a_search_claims_of_random_predictions_is_never_verified(rate: floa
                 Judgement(value, -value, value <= 0.0, Prediction("wrong" if value > 0.0 else "right"))
             )
 
-        result = found(noisy, domain, "random", seed=run, noise=run)
+        result = found(noisy, domain, "random", seed=run, render_seed=run)
         checked = verify(partial(map, trial), domain, result.best_u, spp=1, seed=run, claim=result.ending)
         assert checked.ending is not Ending.FOUND
 

@@ -248,7 +248,7 @@ def test_fractal_noise_fills_its_range_and_wraps_around() -> None:
 def test_the_tables_have_five_rows() -> None:
     for module in (filters, corruption):
         tables = {name: table for name, table in vars(module).items() if name.isupper() and isinstance(table, tuple)}
-        for other in ("NAMES", "ICE_COLOR", "LUMA_WEIGHTS"):
+        for other in ("CORRUPTION_NAMES", "ICE_COLOR", "LUMA_WEIGHTS"):
             tables.pop(other, None)
         assert tables and all(len(table) == 5 for table in tables.values()), tables.keys()
 

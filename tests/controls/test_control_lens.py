@@ -113,7 +113,7 @@ def test_dots_that_may_only_change_their_opacity_stay_spread(scene: SceneDescrip
 
 
 def test_the_places_of_the_dots_keep_to_a_range_that_is_given(scene: SceneDescription) -> None:
-    bound = LensControl(x=[0.0, 0.5], y=[0.2, 0.4], opacity=[0, 1], n_dots=8).bind(scene)
+    bound = LensControl(x=[0.0, 0.5], y=[0.2, 0.4], opacity=[0, 1], dots=8).bind(scene)
     places = torch.stack([bound.values(bound.start)["x"], bound.values(bound.start)["y"]], dim=1)
     assert float(places[:, 0].max()) <= 0.5 and float(places[:, 1].min()) >= 0.2
     assert len({tuple(place) for place in places.tolist()}) == 8

@@ -222,8 +222,8 @@ def _check_not_lost(chains: Sequence[Chain], done: BatchResult) -> None:
     if done.lost:
         lost_attack = chains[done.items[0]][0]
         title = lost_attack.config.object
-        if lost_attack.of != title:
-            title += f" with {lost_attack.of}"
+        if lost_attack.subject != title:
+            title += f" with {lost_attack.subject}"
         raise ClusterError(f"{title}: {done.lost}; leave it out, or go on without it")
 
 

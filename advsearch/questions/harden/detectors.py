@@ -484,7 +484,7 @@ class SegmenterTrainer(DetectorTrainer):
         levels = item.levels.flip(1) if is_mirrored else item.levels
         with torch.no_grad():
             classes = self.work.model(levels[None] / 255.0)[0].argmax(dim=0)
-        object_mask = region.at(tuple(classes.shape)).to(classes.device)
+        object_mask = region.resize_mask(tuple(classes.shape)).to(classes.device)
         if is_mirrored:
             object_mask = object_mask.flip(1)
         x = self.student.model.prepare(levels[None] / 255.0)[:1]

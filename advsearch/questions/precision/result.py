@@ -272,7 +272,7 @@ SLOPE_COLUMNS: Mapping[str, views.Column] = {
     "theory": lambda slope: (
         ""
         if slope.theory is None
-        else f"{slope.theory:.3g}" + " or steeper" * slope.may_be_steeper
+        else f"{slope.theory:.3g}" + " or steeper" * slope.or_steeper
     ),
     "points": "{0.points}",
     "": lambda slope: {
