@@ -161,7 +161,7 @@ def test_an_old_llvm_takes_the_probe_down_and_nothing_else(monkeypatch: pytest.M
         pytest.skip("no libLLVM 15 or 16 on this machine")
     code = (
         "import runpy, advsearch.scene.mitsuba_backend.llvm as llvm, advsearch.cli.doctor_probe as probe\n"
-        "llvm.MINIMUM = 15; probe.TRIALS = {'render': probe.probe_renderer}; probe.main()"
+        "llvm.MIN_VERSION = 15; probe.TRIALS = {'render': probe.probe_renderer}; probe.main()"
     )
     monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, str(old[0]))
     monkeypatch.setenv("HOME", os.devnull + "/none")  # no kernels from an earlier render

@@ -62,9 +62,9 @@ def test_what_the_search_moved_allows_as_small_a_part_of_it() -> None:
     assert not compare_views(lambda number: ComparedView(1.0, 9.0, 1.0, 3, margin_change=10.0)).is_accepted
 
 
-@pytest.mark.parametrize("broken", [{"margin": math.nan}, {"square": math.nan}, {"margin": math.inf}])
+@pytest.mark.parametrize("broken", [{"margin_bias": math.nan}, {"squared_error": math.nan}, {"margin_bias": math.inf}])
 def test_what_is_no_number_is_refused(broken: dict[str, float]) -> None:
-    given: dict[str, Any] = {"square": 1.0, "allowed": 9.0, "margin": 0.0, "pictures": 3, **broken}
+    given: dict[str, Any] = {"squared_error": 1.0, "allowed_squared_error": 9.0, "margin_bias": 0.0, "n_traced": 3, **broken}
     assert not compare_views(lambda number: ComparedView(**given)).is_accepted
 
 
@@ -82,7 +82,7 @@ class Tracer:
     def noisy(self, seed: int) -> Tensor:
         return self.picture + self.noise * torch.randn(64, 64, 3, generator=torch.Generator().manual_seed(seed % 2**31))
 
-    def halves(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
+    def render_halves(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
         return self.noisy(seed + 1), self.noisy(seed + 2), self.picture
 
     def mask(self, u: Tensor) -> Tensor:
