@@ -91,7 +91,7 @@ class StandInProblem:
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Any]:
         return {f"u.{number}": {"value": float(value), "unit": "1"} for number, value in enumerate(u)}
 
-    def conditions_of(self, u: Tensor, seed: int) -> dict[str, Any]:
+    def describe_conditions(self, u: Tensor, seed: int) -> dict[str, Any]:
         return {}
 
 

@@ -217,7 +217,7 @@ def test_a_texture_beside_a_pose_is_differentiated_once_and_nothing_geometric_fo
         asked.append((method, *wrt))
         return original(inputs, cotangent, seed, spp, wrt=wrt, method=method)
 
-    monkeypatch.setattr(render.scene, "adjoint", spy)
+    monkeypatch.setattr(render.scene, "render_adjoint", spy)
     _, gradient = render.gradient(make_smooth_loss((SIZE, SIZE)), find_interior_point(render), 0, 4)
     assert asked == [("path", "object.base_color")]
     assert bool(gradient[:-1].any()) and float(gradient[-1]) != 0.0

@@ -80,7 +80,7 @@ class FakeRenderer:
     stops_with: type[BaseException] = KeyboardInterrupt
     calls = 0
     level: float | None = None
-    composed = ""
+    composition_reason = ""
 
     def __init__(
         self, scene: Any, space: Any, size: tuple[int, int], denoise: str, seed: int, sampler: str = "independent"

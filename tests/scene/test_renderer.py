@@ -186,8 +186,8 @@ def test_pictures_guides_and_gradients_have_noise_of_their_own(
         used.append(seed)
         return adjoint(inputs, cotangent, seed, spp, **more)
 
-    monkeypatch.setattr(scene, "pictures", pictured)
-    monkeypatch.setattr(scene, "adjoint", differentiated)
+    monkeypatch.setattr(scene, "render_images", pictured)
+    monkeypatch.setattr(scene, "render_adjoint", differentiated)
     for seed in (0, 1):
         loss(denoised, inside(denoised).requires_grad_(), seed, 1).backward()
     assert len(set(used)) == len(used) == 2 * 3
@@ -214,7 +214,7 @@ def test_the_denoiser_brings_few_samples_close_to_many(raw: Renderer, denoised: 
 def test_non_finite_radiance_is_counted_and_set_to_zero(raw: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = torch.full((SIZE, SIZE, 3), 0.5)
     broken[0, 0, 0], broken[1, 1, 1] = float("nan"), float("inf")
-    monkeypatch.setattr(raw.scene, "pictures", lambda *_, **__: [broken])
+    monkeypatch.setattr(raw.scene, "render_images", lambda *_, **__: [broken])
     before = raw.non_finite
     with torch.no_grad():
         image = raw(raw.start, seed=0, spp=1)
