@@ -62,7 +62,7 @@ class StandInProblem:
     search_depth: int | None = None
     seed: int = 3
     steps: int = 0
-    draws: int = 1
+    n_draws: int = 1
     plan: StandInPlan = StandInPlan()
 
     def _logits(self, u: Tensor, seed: int) -> Tensor:
