@@ -39,7 +39,7 @@ class StandInPlan:
     def to_dict(self) -> dict[str, Any]:
         return {"groups": []}
 
-    def restored(self, stored: dict[str, Any]) -> StandInPlan:
+    def restore(self, stored: dict[str, Any]) -> StandInPlan:
         return self
 
 

@@ -87,14 +87,14 @@ def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatc
     again = make_configured_controls(job.config, job.config.controls)
     texture: Any
     for texture in (job.controls[0], again[0]):
-        assert {"epsilon": 0.07, "norm": "l2", "resolution": 16}.items() <= texture.settings().items()
+        assert {"epsilon": 0.07, "norm": "l2", "resolution": 16}.items() <= texture.to_settings().items()
 
 
 def test_what_varies_by_chance_takes_all_but_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(python, "run_attack", lambda parts, *_: parts)
     job: Any = advsearch.attack("mug", controls=["geometry"], over=["texture:label"], **ALL)
-    assert job.controls[0].settings() == {"epsilon": 0.07}
-    assert job.over[0].settings() == {"kind": "texture", "norm": "l2", "resolution": 16}
+    assert job.controls[0].to_settings() == {"epsilon": 0.07}
+    assert job.over[0].to_settings() == {"kind": "texture", "norm": "l2", "resolution": 16}
 
 
 @pytest.mark.parametrize("asked", ["texture", "texture:object", {"label": {"kind": "texture"}}])

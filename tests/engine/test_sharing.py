@@ -27,7 +27,7 @@ def queries(count: int, **more: Any) -> list[Query]:
 
 def test_answers_come_in_the_order_of_the_queries_whoever_gives_them() -> None:
     here, there = StandInProblem(), StandInProblem()
-    here.prepared, here.renderer = None, RendererCount()  # type: ignore[attr-defined]
+    here.preparation, here.renderer = None, RendererCount()  # type: ignore[attr-defined]
     problem: Any = here
     workers: Any = StandInWorkers(InProcess(make_worker_call(lambda name: there)))
     alone, shared = (list(ParallelEvaluator(problem, executor)(queries(5))) for executor in (None, workers))

@@ -35,9 +35,9 @@ def finding(trial: Callable[[str, int, Tensor], Any]) -> Any:
         return [trial(kind, number, u) for number, u in configurations.items()]
 
     problem = SimpleNamespace(domain=DOMAIN, seed=0, rule=WORST_CASE, steps=1)
-    findings = SimpleNamespace(transport=None, smallest=None, search=None)
+    findings = SimpleNamespace(predictor=None, bracket=None, search=None)
     searches: Any = SimpleNamespace(problem=problem, findings=findings, policy=None, begin=said, search=search)
-    verifier: Any = SimpleNamespace(begin=said, trials=trials, count=20)
+    verifier: Any = SimpleNamespace(begin_stage=said, try_configurations=trials, n_trials=20)
     with suppress(KeyboardInterrupt):
         find_smallest(searches, searches.policy, verifier)
     return findings

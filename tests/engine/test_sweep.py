@@ -1187,9 +1187,9 @@ def test_an_object_is_taken_away_however_it_is_posed_really_rendered() -> None:
 def check_away(render: Any) -> None:
     u = torch.full_like(render.start, 0.3)
     there = render(u, 1, 4)
-    render.scene.assembly.away = True
+    render.scene.assembly.is_object_hidden = True
     gone, seen = render(u, 1, 4), int(render.mask(u).sum())
-    render.scene.assembly.away = False
+    render.scene.assembly.is_object_hidden = False
     assert seen == 0 < int(render.mask(u).sum()) and float((gone - there).abs().mean()) > 0.02
 
 

@@ -101,11 +101,11 @@ def test_a_drop_shows_the_scene_upside_down() -> None:
 @pytest.mark.medium
 def test_what_is_true_of_a_picture_is_so_of_the_scene_without_drops() -> None:
     wet, dry = renderer_of(40), renderer_of(0)
-    ours, theirs = (one.surfaces(one.start).seen("object") for one in (wet, dry))
+    ours, theirs = (one.surfaces(one.start).visible_mask("object") for one in (wet, dry))
     assert (ours != theirs).float().mean() < 0.002  # the ray through a pixel's middle is looked up, not worked out
     pictures = [one.radiance(one.start, seed=1, spp=16) for one in (wet, dry)]
     assert float((pictures[0] - pictures[1]).abs().mean()) > 0.02 * float(pictures[1].mean())
-    assert wet.scene.made[0].gain == dry.scene.made[0].gain
+    assert wet.scene.definition[0].gain == dry.scene.definition[0].gain
 
 
 @pytest.mark.medium

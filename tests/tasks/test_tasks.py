@@ -289,7 +289,7 @@ def test_tasks_have_names() -> None:
 @pytest.fixture
 def named(monkeypatch: pytest.MonkeyPatch) -> None:
     """`yaw` is the name of a task."""
-    monkeypatch.setattr(TASKS, "own", {"classification": Classification, "yaw": Yaw})
+    monkeypatch.setattr(TASKS, "built_ins", {"classification": Classification, "yaw": Yaw})
 
 
 def test_a_task_is_made_with_options(named: None) -> None:
