@@ -94,7 +94,7 @@ def test_what_varies_by_chance_takes_all_but_the_budget(monkeypatch: pytest.Monk
     monkeypatch.setattr(python, "run_attack", lambda parts, *_: parts)
     job: Any = advsearch.attack("mug", controls=["geometry"], over=["texture:label"], **ALL)
     assert job.controls[0].to_settings() == {"epsilon": 0.07}
-    assert job.over[0].to_settings() == {"kind": "texture", "norm": "l2", "resolution": 16}
+    assert job.random_controls[0].to_settings() == {"kind": "texture", "norm": "l2", "resolution": 16}
 
 
 @pytest.mark.parametrize("asked", ["texture", "texture:object", {"label": {"kind": "texture"}}])
