@@ -356,6 +356,7 @@ class Experiment(Generic[AnyResult]):
 
     def _make_python_function(self) -> Callable[..., Any]:
         """Create the function for Python callers from the settings."""
+        # only Python callers need it
         from advsearch.api.keywords import (
             make_config,
             with_settings_signature,

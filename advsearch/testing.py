@@ -222,6 +222,7 @@ def _name_objects(
     """Return settings in which names stand for the scene and for controls, and these
     objects by role and name.
     """
+    # heavy, and pytest imports this module before it collects
     from advsearch.extend import workbench
 
     loading = workbench.loading

@@ -202,7 +202,7 @@ FAULTS = (
     Fault(
         "policies: a mean keeps its bias",
         "advsearch/attacks/policies/pgd.py",
-        "mean = state.direction / (1.0 - self.beta1**state.n_steps_taken)",
+        "mean = state.direction / (1.0 - self.beta1**state.n_updates)",
         "mean = state.direction",
         ("tests/attacks/policies/test_policy_adam.py",),
     ),
@@ -244,8 +244,8 @@ FAULTS = (
     Fault(
         "runs: an export has no metrics",
         "advsearch/runs/export.py",
-        "return [*OWN, *metrics, *seen, *AFTER]",
-        "return [*OWN, *seen, *AFTER]",
+        "return [*OWN, *metrics, *values, *AFTER]",
+        "return [*OWN, *values, *AFTER]",
         ("tests/runs/test_runs.py",),
     ),
     Fault(

@@ -188,6 +188,7 @@ def _make_schema(names: list[str], first_records: Sequence[JsonObject]) -> Any:
     """Return the Arrow schema of columns: of metrics and values, which have no declared
     type, text where one of the first records has text, else float64.
     """
+    # an optional package
     import pyarrow
 
     arrow_types = {
@@ -208,6 +209,7 @@ def _make_schema(names: list[str], first_records: Sequence[JsonObject]) -> Any:
 
 def _convert_column(values: list[Any], arrow_type: Any) -> list[Any]:
     """Return values as text or float where the column has that type, None as it is."""
+    # an optional package
     import pyarrow
 
     if arrow_type == pyarrow.string():

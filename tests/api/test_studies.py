@@ -178,7 +178,9 @@ def test_a_region_that_is_interrupted_says_how_to_go_on(
 
     monkeypatch.setattr(boxes, "grow_box", stopped)
     monkeypatch.setattr(
-        growing, "find_verdict", lambda verifier, centre: next(verifier.try_configurations("centre", {0: centre})).success
+        growing,
+        "find_verdict",
+        lambda verifier, centre: next(verifier.try_configurations("centre", {0: centre})).success,
     )
     folder = tmp_path / "run"
     flags = (

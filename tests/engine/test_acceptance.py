@@ -64,7 +64,13 @@ def test_what_the_search_moved_allows_as_small_a_part_of_it() -> None:
 
 @pytest.mark.parametrize("broken", [{"margin_bias": math.nan}, {"squared_error": math.nan}, {"margin_bias": math.inf}])
 def test_what_is_no_number_is_refused(broken: dict[str, float]) -> None:
-    given: dict[str, Any] = {"squared_error": 1.0, "allowed_squared_error": 9.0, "margin_bias": 0.0, "n_traced": 3, **broken}
+    given: dict[str, Any] = {
+        "squared_error": 1.0,
+        "allowed_squared_error": 9.0,
+        "margin_bias": 0.0,
+        "n_traced": 3,
+        **broken,
+    }
     assert not compare_views(lambda number: ComparedView(**given)).is_accepted
 
 

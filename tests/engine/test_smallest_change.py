@@ -57,7 +57,7 @@ def test_on_the_way_a_few_trials_do_and_at_the_end_it_is_all() -> None:
         return outcome(u)
 
     findings = finding(trial)
-    assert findings.bracket.closed and findings.smallest.confirmed
+    assert findings.bracket.is_closed and findings.bracket.confirmed
     last = [f"check {findings.bracket.checks - one}" for one in (1, 2)]
     assert sum(tried[kind] for kind in last) == MIN_CONFIRMING_TRIALS
     assert {tried[kind] for kind in tried if kind not in last} == {6, 2}

@@ -28,7 +28,7 @@ def test_a_truth_is_remembered_where_only_base_colours_differ(route: str, asks: 
     routes = {"a.colour": frozenset({route}), "b.time": frozenset({"camera.to_world"})}
     renderer = SimpleNamespace(
         routes=routes,
-        scene=SimpleNamespace(names=("object.base_color", "object.vertices")),
+        scene=SimpleNamespace(input_names=("object.base_color", "object.vertices")),
         surfaces=lambda whole: whole,
     )
     seen: list[float] = []
@@ -41,7 +41,9 @@ def test_a_truth_is_remembered_where_only_base_colours_differ(route: str, asks: 
 
     task = SimpleNamespace(truth=truth, varies=True)
     problem = object.__new__(Problem)
-    vars(problem).update(task=task, space=space, renderer=renderer, facts=partial(Facts, "x", None, None), _truths={})
+    vars(problem).update(
+        task=task, space=space, renderer=renderer, make_facts=partial(Facts, "x", None, None), _truths={}
+    )
     asked = [(0.1, 0.5), (0.2, 0.5), (0.1, 0.7), (0.1, 0.7)]
     found = [problem.find_truth(torch.tensor(one)) for one in asked]
     assert found == pytest.approx([0.5, 0.5, 0.7, 0.7]) and len(seen) == looked

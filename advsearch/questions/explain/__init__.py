@@ -35,7 +35,7 @@ from advsearch.questions.explain.result import (
 if TYPE_CHECKING:
     import pandas as pd
 
-    from advsearch.api.workbench import StoredSweep
+    from advsearch.extend import workbench
 
 
 class ExplainConfig(Config):
@@ -147,8 +147,9 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     )
 
 
-def _read_sweeps(config: ExplainConfig) -> list[StoredSweep]:
+def _read_sweeps(config: ExplainConfig) -> list[workbench.StoredSweep]:
     """Read the rows of the sweeps that the settings name."""
+    # heavy, and the help of the command line reads this module
     from advsearch.extend import workbench
 
     return [
@@ -164,8 +165,13 @@ def _analyze_rows(
     """Find rules, the importance of parameters, and the envelope of right
     predictions.
     """
+    # heavy, and the help of the command line reads this module
     from advsearch.extend import rules
+
+    # likewise
     from advsearch.questions.explain.envelope import find_envelope
+
+    # likewise
     from advsearch.questions.explain.importance import find_importance
 
     choosing, counting = rules.split_in_halves(table, config.seed)
@@ -179,6 +185,7 @@ def _analyze_rows(
 
 def _confirm_rules(renders: Any, found_rules: Any) -> list[RuleRow]:
     """Render configurations inside each rule, and describe the rules."""
+    # heavy, and the help of the command line reads this module
     from advsearch.questions.explain import findings
 
     return [
@@ -190,7 +197,9 @@ def _confirm_rules(renders: Any, found_rules: Any) -> list[RuleRow]:
     ]
 
 
-def read_table(sweeps: Sequence[StoredSweep]) -> tuple[pd.DataFrame, pd.DataFrame]:
+def read_table(
+    sweeps: Sequence[workbench.StoredSweep],
+) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the rows of sweeps that have the object in view, and what varies in them.
 
     Raises:
