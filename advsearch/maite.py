@@ -5,8 +5,8 @@ protocols: `advsearch.maite`.
 
     model = maite.load_model(theirs, input_size=224, value_range=(0, 1))
     advsearch.attack("mug", model, controls="camera", label="coffee mug,cup")
-    maite_tasks.evaluate(model=theirs, dataset=maite.Scenes("mug", "camera", 100,
-    labels=model.labels))
+    scenes = maite.Scenes("mug", "camera", 100, labels=model.labels)
+    maite_tasks.evaluate(model=theirs, dataset=scenes)
 
 The protocols are duck types, so nothing of MAITE is imported.
 """

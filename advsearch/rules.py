@@ -8,8 +8,8 @@ The other half says whether a rule holds.
     table = rules.make_table(rows, ["pose.yaw", "light.power"])
     choosing, counting = rules.split_in_halves(table, seed=0)
     for rule in rules.find_rules(choosing, counting, seed=0).accepted:
-        print([condition.row.text for condition in rule.conditions],
-        rules.estimate_share(rule.inside))
+        print([condition.row.text for condition in rule.conditions])
+        print(rules.estimate_share(rule.inside))
 
 A *table* is a pandas frame with a column for each factor, float64 or a category of
 names in alphabetical order; `correct`, whether the model was right; and `unit`, of what

@@ -2,8 +2,9 @@
 
     from advsearch.testing import assert_right
 
-    def test_the_mug_is_seen_from_all_sides(): assert_right("mug", "model.pt2",
-        at_least=0.9, controls={"camera": {"azimuth": [0, 360]}})
+    def test_the_mug_is_seen_from_all_sides():
+        views = {"camera": {"azimuth": [0, 360]}}
+        assert_right("mug", "model.pt2", at_least=0.9, controls=views)
 
 A failure shows the picture's path and what repeats it. Every call keeps a run, in `run`
 or under runs/.

@@ -6,9 +6,15 @@ map from it to scene inputs, in torch. Most are a handful of named numbers, each
 a range, or a list: they declare the parameters, and say in `scene_inputs` what they do
 to the scene (docs/controls/writing.md):
 
-    class Exposure(Control): kind = "exposure" summary = "How bright the picture is."
-        parameters = (Parameter("stops", (), "stops", -10, 10, 0.0, "Over the metered
-        exposure.", search=(-2, 2)),)
+    class Exposure(Control):
+        kind = "exposure"
+        summary = "How bright the image is."
+        parameters = (
+            Parameter(
+                "stops", (), "stops", -10, 10, 0.0, "Over the metered exposure.",
+                search=(-2, 2),
+            ),
+        )
 
         def scene_inputs(self, values, so_far):
             return {"camera.exposure": values["stops"]}

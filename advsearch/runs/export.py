@@ -275,7 +275,8 @@ def _imported(
         record = parse_json(line.decode())
     except ValueError as error:
         raise _wrong(folder, number, str(error)) from None
-    if not isinstance(record, dict) or not isinstance(record.get("render_args"), dict):
+    render_args = record.get("render_args") if isinstance(record, dict) else None
+    if not isinstance(record, dict) or not isinstance(render_args, dict):
         raise _wrong(folder, number, "a line without render_args")
     label, label_index = _parse_prediction(record.get("prediction"), classes)
     loss = record.get("loss")
@@ -286,19 +287,17 @@ def _imported(
         margin=0.0 - loss if isinstance(loss, (int, float)) else None,
         label=label,
         label_index=label_index,
-        values=_import_values(record),
+        values=_import_values(record, render_args),
     )
     return row, _find_picture(folder, str(record.get("id")))
 
 
-def _import_values(record: JsonObject) -> dict[str, Value]:
+def _import_values(record: JsonObject, render_args: JsonObject) -> dict[str, Value]:
     """Return the parameters of a line of 3DB's log, those of lists by their index."""
     values: dict[str, Value] = {
         "object": _value(record.get("model")),
         "environment": _value(record.get("environment")),
     }
-    render_args = record["render_args"]
-    assert isinstance(render_args, dict)
     for name, value in render_args.items():
         if isinstance(value, list):
             for index, component in enumerate(value):
