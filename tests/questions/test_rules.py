@@ -11,7 +11,7 @@ from scipy.stats import fisher_exact
 
 from advsearch.errors import InputError
 from advsearch.questions.explain.clusters import find_clusters
-from advsearch.questions.explain.envelope import find_envelope
+from advsearch.questions.explain.envelope import find_envelope, list_factor_peels
 from advsearch.questions.explain.importance import find_importance
 from advsearch.rules import (
     CountedRule,
@@ -337,3 +337,17 @@ def test_few_or_equal_failures_are_one_kind() -> None:
     assert one.members == ((0,),) and one.silhouette is None and not one.apart
     assert [len(members) for members in find_clusters(np.ones((30, 5)), 0).members] == [30]
     assert len(find_clusters(np.random.default_rng(0).standard_normal((7, 4)), 0).members) == 1
+
+
+def test_peels_of_values_that_rounding_would_leave() -> None:
+    values = 1000.0 + np.linspace(0.1, 0.9, 41)
+    condition = RuleCondition("camera.distance", "m")
+    lower, upper = list_factor_peels(condition, pd.Series(values))
+    assert lower.low == values.min()
+    assert upper.high == np.sort(values)[-2]
+
+
+def test_peels_take_a_twentieth_at_each_end() -> None:
+    values = np.linspace(0.0, 100.0, 101)
+    lower, upper = list_factor_peels(RuleCondition("camera.azimuth", "degrees"), pd.Series(values))
+    assert (lower.low, upper.high) == (5.0, 95.0)

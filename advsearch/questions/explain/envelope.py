@@ -103,7 +103,11 @@ def list_peels(
 def list_factor_peels(
     condition: rules.RuleCondition, column: pd.Series
 ) -> Iterator[rules.RuleCondition]:
-    """Yield conditions without one name, or without the lowest or highest values."""
+    """Yield narrower conditions: without one option, the lowest or highest values.
+
+    The step of PRIM (Friedman and Fisher 1999): `PEELED_FRACTION` of the values goes
+    at an end. The column holds the rows that fulfil the condition.
+    """
     if column.dtype == "category":
         names = condition.options or frozenset(column.cat.categories)
         if len(names) > 1:
@@ -113,15 +117,19 @@ def list_factor_peels(
         return
 
     values = column.to_numpy()
+    lowest = float(values.min())
+    highest = float(values.max())
     low = float(f"{np.quantile(values, PEELED_FRACTION):.3g}")
     high = float(f"{np.quantile(values, 1.0 - PEELED_FRACTION):.3g}")
-    # With few different values the smallest one is removed.
-    if low < values.min() or low >= values.max():
-        low = float(values.min())
+
+    # A condition is low < value <= high. With few different values, or where rounding
+    # leaves their range, just the lowest one is removed, and just the highest one.
+    if not lowest <= low < highest:
+        low = lowest
     yield replace(condition, low=low)
-    if high < values.max():
+    if lowest <= high < highest:
         yield replace(condition, high=high)
-    else:
-        lower_values = values[values < values.max()]
-        if len(lower_values):
-            yield replace(condition, high=float(lower_values.max()))
+        return
+    lower_values = values[values < highest]
+    if len(lower_values):
+        yield replace(condition, high=float(lower_values.max()))
