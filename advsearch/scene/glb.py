@@ -125,7 +125,7 @@ CAMERA_ENTRY = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.0
 def encode_glb(meshes: Sequence[Shape]) -> bytes:
     """Return meshes as a binary glTF file with PNG textures."""
     buffer = GlbBuffer()
-    return buffer.to_bytes(_make_header(buffer, meshes, png_of))
+    return buffer.to_bytes(_make_document(buffer, meshes, png_of))
 
 
 def encode_web_glb(
@@ -145,7 +145,7 @@ def encode_web_glb(
         note: text for readers, in `asset.extras`.
     """
     buffer = GlbBuffer()
-    header = _make_header(buffer, [*adversarial, *clean], _encode_jpeg)
+    header = _make_document(buffer, [*adversarial, *clean], _encode_jpeg)
     # Rows: its axes, then its position.
     our_rows = camera[:3].T.astype(np.float32)
     columns = np.eye(4)
@@ -167,19 +167,22 @@ def encode_web_glb(
     return buffer.to_bytes(header)
 
 
-def _make_header(
+def _make_document(
     buffer: GlbBuffer,
     meshes: Sequence[Shape],
     encode_image: Callable[[ByteImage], bytes],
 ) -> dict[str, Any]:
-    """Return the header of a file of meshes, whose data is added to a buffer.
+    """Return the glTF document (the JSON part) of a file of meshes.
+
+    Their data and their images are appended to the buffer. Nodes, meshes and materials
+    have the order of the shapes; every node is in the one scene.
 
     Args:
-        buffer: the buffer.
+        buffer: gets the data.
         meshes: one node each.
         encode_image: encodes an image (H, W, 3).
     """
-    header: dict[str, Any] = {
+    document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
@@ -196,16 +199,18 @@ def _make_header(
     }
     for index, shape in enumerate(meshes):
         primitive = {**_add_geometry(buffer, shape), "material": index}
-        header["meshes"].append({"name": shape.name, "primitives": [primitive]})
-        header["materials"].append(_add_material(header, buffer, shape, encode_image))
-    used = {
+        document["meshes"].append({"name": shape.name, "primitives": [primitive]})
+        document["materials"].append(
+            _add_material(document, buffer, shape, encode_image)
+        )
+    extensions = {
         name
-        for material in header["materials"]
+        for material in document["materials"]
         for name in material.get("extensions", ())
     }
-    if used:
-        header["extensionsUsed"] = sorted(used)
-    return header
+    if extensions:
+        document["extensionsUsed"] = sorted(extensions)
+    return document
 
 
 def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:

@@ -286,22 +286,26 @@ class SurfaceParts:
 
 
 def _unwrap_mesh(mesh: Mesh) -> Float64Array:
-    """Return new texture coordinates (F, 3, 2) of a mesh that do not overlap."""
+    """Return new texture coordinates (F, 3, 2) of a mesh that do not overlap.
+
+    Vertices at the same position count as one, so that charts are not cut at old seams,
+    and the mesh is scaled to a size of 1, as `unwrap` expects. Old texture coordinates,
+    normals and colors play no part.
+    """
     lower = mesh.vertices.min(axis=0)
     upper = mesh.vertices.max(axis=0)
     extent = max(float((upper - lower).max()), 1e-12)
     points = (mesh.vertices - lower).astype(np.float64) / extent
-    unique_points, index = np.unique(points, axis=0, return_inverse=True)
-    corners = index.reshape(-1)[mesh.faces.astype(np.int64)]
-    unknown = np.full((len(corners), 3, 3), np.nan)
-    part = np.zeros(len(corners), np.int64)
+    unique_points, unique_index = np.unique(points, axis=0, return_inverse=True)
+    faces = unique_index.reshape(-1)[mesh.faces.astype(np.int64)]
+    n_faces = len(faces)
     soup = Soup(
-        unique_points,
-        corners,
-        part,
-        unknown,
-        unknown[..., :2],
-        np.ones_like(unknown),
+        points=unique_points,
+        faces=faces,
+        part=np.zeros(n_faces, np.int64),
+        normals=np.full((n_faces, 3, 3), np.nan),
+        uvs=np.full((n_faces, 3, 2), np.nan),
+        colors=np.ones((n_faces, 3, 3)),
     )
     return unwrap(soup).uvs
 

@@ -242,7 +242,7 @@ class FileImages:
     def load(
         self,
         key: Hashable,
-        content: Callable[[], bytes],
+        read_bytes: Callable[[], bytes],
         kind: ImageKind,
         name: str,
         message: str,
@@ -250,33 +250,43 @@ class FileImages:
         """Return an image's values, as `load_display_image`; None, and a note, if it
         fails.
 
+        An image is decoded once for each kind, and so is its failure; the note is added
+        at each call.
+
         Args:
             key: the same for the same image.
-            content: returns its file; raises OSError or ValueError if there is none.
+            read_bytes: returns its file; raises OSError or ValueError if there is none.
             kind: what it holds.
             name: its name in the file.
             message: the note, with {name} and {why}.
         """
         if (key, kind) not in self._cache:
-            self._cache[key, kind] = self._decode(content, kind, name)
-        values = self._cache[key, kind]
-        if not isinstance(values, str):
-            return values
-        self.note_missing(name, values, message)
-        return None
+            self._cache[key, kind] = self._decode(read_bytes, kind, name)
+        image_or_reason = self._cache[key, kind]
+        if isinstance(image_or_reason, str):
+            self.note_missing(name, image_or_reason, message)
+            return None
+        return image_or_reason
 
     def note_missing(self, name: str, reason: str, message: str) -> None:
-        """Note that an image is missing, and what replaces it."""
+        """Note that an image is missing, and what replaces it.
+
+        The message has {name} and {why}; the latter becomes the reason.
+        """
         self.notes.warn(
             message.replace("{name}", format_name(name)).replace("{why}", reason)
         )
 
     def _decode(
-        self, content: Callable[[], bytes], kind: ImageKind, name: str
+        self, read_bytes: Callable[[], bytes], kind: ImageKind, name: str
     ) -> Float32Array | str:
-        """Return the values of an image, or the reason why there are none."""
+        """Return the values of an image, or the reason why there are none.
+
+        An image that is read counts towards the largest number of pixels of all images
+        of its sort (numbers, or colors); if it was made smaller, a note says so.
+        """
         try:
-            image = Image.open(io.BytesIO(content()), formats=FORMATS)
+            image = Image.open(io.BytesIO(read_bytes()), formats=FORMATS)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
             return self.references.refused.get(plain_name(name), UNREADABLE)
         (width, height) = image.size
