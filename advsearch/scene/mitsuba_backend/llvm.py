@@ -64,7 +64,10 @@ Version = tuple[int, ...]
 
 @dataclass(frozen=True)
 class LibraryFile:
-    """A libLLVM file."""
+    """A libLLVM file.
+
+    As text it is its path, and in parentheses its version and why it is refused.
+    """
 
     path: Path
     version: Version  # major first, or ()

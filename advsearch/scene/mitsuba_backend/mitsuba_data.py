@@ -75,10 +75,11 @@ def find_plugin_numbers(
 def _find_numbers(
     description: SceneDescription,
 ) -> tuple[dict[str, PluginNumber], dict[str, str]]:
-    """Find all numbers and colors of a scene.
+    """Find all numbers and colors of a scene; that of the last description is
+    remembered.
 
     Returns:
-        They by their key, with an input if they have one; and the type of the rest.
+        Them by their key, with an input if they have one; and the type of the rest.
     """
     scene = MitsubaScene(description, SMALL_RESOLUTION)
     inputs = {
