@@ -64,7 +64,7 @@ class Parameter:
     def is_number(value: object) -> TypeGuard[float]:
         """Return whether a value is a number that float32 has.
 
-        No truth value, not NaN, and at most `LARGEST`.
+        No truth value, not NaN, and at most `MAX_VALUE` either way.
         """
         is_real = isinstance(value, (int, float)) and not isinstance(value, bool)
         return is_real and abs(value) <= Parameter.MAX_VALUE  # type: ignore[arg-type]
@@ -86,17 +86,17 @@ class Parameter:
     ) -> Parameter:
         """Make a number that moves no outlines; see `moving` for one that does."""
         return cls(
-            name,
-            (),
-            unit,
-            low,
-            high,
-            default,
-            text,
-            periodic,
-            False,
-            search,
-            log,
+            name=name,
+            shape=(),
+            unit=unit,
+            low=low,
+            high=high,
+            default=default,
+            description=text,
+            periodic=periodic,
+            moves_silhouettes=False,
+            search=search,
+            log=log,
             estimators=estimators,
         )
 
@@ -117,17 +117,17 @@ class Parameter:
     ) -> Parameter:
         """Make a number that can move an outline in the image."""
         return cls(
-            name,
-            (),
-            unit,
-            low,
-            high,
-            default,
-            text,
-            periodic,
-            True,
-            search,
-            log,
+            name=name,
+            shape=(),
+            unit=unit,
+            low=low,
+            high=high,
+            default=default,
+            description=text,
+            periodic=periodic,
+            moves_silhouettes=True,
+            search=search,
+            log=log,
             estimators=estimators,
         )
 
@@ -142,17 +142,17 @@ class Parameter:
         estimators: tuple[str, ...] = (),
         moves_silhouettes: bool = False,
     ) -> Parameter:
-        """Make a choice among names."""
+        """Make a choice among names, whose values are the indices of its options."""
         return cls(
-            name,
-            (),
-            "name",
-            0.0,
-            len(options) - 1.0,
-            default,
-            text,
-            False,
-            moves_silhouettes,
+            name=name,
+            shape=(),
+            unit="name",
+            low=0.0,
+            high=len(options) - 1.0,
+            default=default,
+            description=text,
+            periodic=False,
+            moves_silhouettes=moves_silhouettes,
             options=options,
             estimators=estimators,
         )
@@ -174,13 +174,13 @@ class Parameter:
         descriptions = [f"{name.capitalize()} {text}" for name in CHANNELS]
         return tuple(
             cls(
-                name,
-                (),
-                "sRGB",
-                low,
-                1.0,
-                default,
-                description,
+                name=name,
+                shape=(),
+                unit="sRGB",
+                low=low,
+                high=1.0,
+                default=default,
+                description=description,
                 search=search,
                 estimators=estimators,
             )
@@ -193,13 +193,13 @@ class Parameter:
 def _surface(name: str, text: str, search: tuple[float, float]) -> Parameter:
     """Return a parameter of the principled surface."""
     return Parameter(
-        name,
-        (),
-        "1",
-        0.0,
-        1.0,
-        "the material's own",
-        text,
+        name=name,
+        shape=(),
+        unit="1",
+        low=0.0,
+        high=1.0,
+        default="the material's own",
+        description=text,
         search=search,
         estimators=Parameter.LIT,
     )
@@ -403,13 +403,13 @@ def _lamps(whose: str) -> Parameter:
         "beam; in the avenue."
     )
     return Parameter(
-        "lamps",
-        (),
-        "name",
-        0.0,
-        len(LAMPS) - 1.0,
-        LAMPS[0],
-        text,
+        name="lamps",
+        shape=(),
+        unit="name",
+        low=0.0,
+        high=len(LAMPS) - 1.0,
+        default=LAMPS[0],
+        description=text,
         options=LAMPS,
         estimators=(),
     )
@@ -582,11 +582,12 @@ def parse_mesh_name(name: str) -> str | None:
 def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
     """Return every setting's value: the defaults, and over them what was given.
 
-    None where the scene works a value out. Settings of meshes around the object are
-    there where they were given.
+    None where the scene works a value out. A choice has the index of its option.
+    Settings of meshes around the object are there where they were given.
 
     Raises:
-        InputError: a value is not a finite number inside its range.
+        InputError: a value is not a finite number inside its range, or two settings
+        contradict each other.
         UnknownNameError: a name is not a setting.
     """
     if "camera.elevation" in settings and "camera.height" in settings:

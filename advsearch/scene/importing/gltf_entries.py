@@ -99,7 +99,11 @@ class Entry(BaseModel):
         return keys_of_extension
 
     def iterate_references(self) -> Iterator[tuple[str, int]]:
-        """Yield a list of the header, and an index in it, for each reference."""
+        """Yield a list of the header, and an index in it, for each reference.
+
+        References are fields named in `REFERENCED_LISTS`: an index, or lists or
+        dictionaries of some.
+        """
         for name, value in vars(self).items():
             queue: list[Any] = [value] if name in REFERENCED_LISTS else []
             for item in queue:  # it grows
@@ -394,7 +398,7 @@ class MaterialEntry(Entry):
         )
 
     def can_read(self, use: TextureUse | None) -> bool:
-        """Return whether a texture has the coordinates of `layout`, or is None.
+        """Return whether a texture has the coordinates of `layout_texture`, or is None.
 
         Others are left out.
         """

@@ -79,31 +79,37 @@ def load_display_image(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large images and odd metadata
         image.load()
-        scale = 1.0 if limit is None else limit / max(height, width)
-        # Value of each of the 256 levels.
-        display: Float32Array = np.arange(256, dtype=np.float32) / np.float32(255.0)
-        if scale >= 1.0:
-            return np.asarray(display[steps_of(image, alpha=keep_alpha)])
-        target = max(1, round(height * scale)), max(1, round(width * scale))
-        linear = display if is_raw else srgb_to_linear(display)
+        shrink = 1.0 if limit is None else limit / max(height, width)
+        # Tables of the 256 levels.
+        display_of_level: Float32Array = np.arange(256, dtype=np.float32) / np.float32(
+            255.0
+        )
+        if shrink >= 1.0:
+            return np.asarray(display_of_level[steps_of(image, alpha=keep_alpha)])
+        target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
+        linear_of_level = (
+            display_of_level if is_raw else srgb_to_linear(display_of_level)
+        )
         is_weighted = not is_raw and (keep_alpha or image.has_transparency_data)
 
         def load_band(top: int, end: int) -> Float32Array:
+            """Return rows of colors; with opacity also that, and their product."""
             band_image = image.crop((0, top, width, end))
             levels = steps_of(band_image, alpha=is_weighted)
-            colors = linear[levels[:, :, :3]]
+            colors = linear_of_level[levels[:, :, :3]]
             if not is_weighted:
                 return colors
-            opacity = display[levels[:, :, 3:]]
+            opacity = display_of_level[levels[:, :, 3:]]
             return np.concatenate([colors, opacity, colors * opacity], axis=2)
 
-        averaged = average_in_bands(load_band, (height, width), target)
+        averaged = average_in_bands(load_band, (height, width), target_shape)
         if is_raw:
             return averaged
         colors = averaged[:, :, :3]
         opacity = averaged[:, :, 3:4]
         if is_weighted:
             weighted_colors = averaged[:, :, 4:] / np.maximum(opacity, 1e-9)
+            # Where all is transparent, the mean color stays.
             colors = np.where(opacity > 0.0, weighted_colors, colors)
         display_colors = linear_to_srgb(colors)
         if not keep_alpha:
@@ -166,26 +172,32 @@ def _average(
         .transpose(1, 0, 2)
         .reshape(columns, height * channels)
     )
-    result = (
+    averaged = (
         (column_weights @ transposed)
         .reshape(width, height, channels)
         .transpose(1, 0, 2)
     )
-    return np.ascontiguousarray(result, dtype=np.float32)
+    return np.ascontiguousarray(averaged, dtype=np.float32)
 
 
 def _compute_overlaps(source: int, target: int) -> sparse.csr_array:
     """Return the weights (target, source) of source cells in target cells.
 
-    They are the overlapping lengths, normalised so that rows sum to 1.
+    They are the overlapping lengths along an axis, normalised so that rows sum to 1:
+    the edges of both grids cut it into pieces, each of which lies in one cell of
+    either.
     """
-    cells = np.arange(target + 1) * (source / target)
-    edges = np.unique(np.concatenate([cells, np.arange(source + 1, dtype=np.float64)]))
-    centers = (edges[1:] + edges[:-1]) / 2
-    lengths = np.diff(edges)
-    row = np.minimum((centers * (target / source)).astype(np.int64), target - 1)
-    column = np.minimum(centers.astype(np.int64), source - 1)
-    overlaps = sparse.coo_array((lengths, (row, column)), shape=(target, source))
+    target_edges = np.arange(target + 1) * (source / target)
+    all_edges = np.unique(
+        np.concatenate([target_edges, np.arange(source + 1, dtype=np.float64)])
+    )
+    centers = (all_edges[1:] + all_edges[:-1]) / 2
+    lengths = np.diff(all_edges)
+    target_cell = np.minimum((centers * (target / source)).astype(np.int64), target - 1)
+    source_cell = np.minimum(centers.astype(np.int64), source - 1)
+    overlaps = sparse.coo_array(
+        (lengths, (target_cell, source_cell)), shape=(target, source)
+    )
     weights = overlaps.tocsr()
     normalization = sparse.diags_array(1.0 / np.asarray(weights.sum(axis=1)).ravel())
     return sparse.csr_array(normalization @ weights)
@@ -236,7 +248,7 @@ class FileImages:
     def load_file(
         self, name: str, kind: ImageKind, message: str
     ) -> Float32Array | None:
-        """Return the values of an image that the file names; see `read`."""
+        """Return the values of an image that the file names; see `load`."""
         return self.load(name, lambda: self.references.get(name), kind, name, message)
 
     def load(
