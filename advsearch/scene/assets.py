@@ -133,10 +133,9 @@ class Material:
 
         Their names are `prefix` and the attribute's.
         """
+        new_values = {name: values.get(prefix + name) for name in vars(self)}
         replaced = {
-            name: value
-            for name in vars(self)
-            if (value := values.get(prefix + name)) is not None
+            name: value for name, value in new_values.items() if value is not None
         }
         return replace(self, **replaced)
 

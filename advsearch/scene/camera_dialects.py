@@ -174,9 +174,8 @@ def translate_entries(
         FileFormatError: it has another projection, several cameras of which none is
             named, or lacks numbers.
     """
-    orbslam_cameras = [
-        match[1] for name in data if (match := ORBSLAM_CAMERA.fullmatch(name))
-    ]
+    orbslam_matches = map(ORBSLAM_CAMERA.fullmatch, data)
+    orbslam_cameras = [match[1] for match in orbslam_matches if match]
     if orbslam_cameras:
         return _translate_orbslam(path, camera_name, data, orbslam_cameras)
     kitti_cameras = _find_kitti(data)
@@ -252,9 +251,10 @@ def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
     for name, value in data.items():
         if not isinstance(value, str):
             continue
+        match = KITTI_RAW.fullmatch(name) or KITTI_RECTIFIED.fullmatch(name)
         if KITTI_PROJECTION.fullmatch(name):
             cameras[name] = name
-        elif match := KITTI_RAW.fullmatch(name) or KITTI_RECTIFIED.fullmatch(name):
+        elif match:
             cameras[match[1]] = name
     return cameras
 

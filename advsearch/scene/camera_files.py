@@ -291,7 +291,7 @@ def _read_colmap(
     spec: str, path: str, camera_name: str, lines: Sequence[str]
 ) -> CameraModel:
     """Return the model of a camera of COLMAP's cameras.txt."""
-    words_by_id = {words[0]: words for line in lines if (words := line.split())}
+    words_by_id = {line.split()[0]: line.split() for line in lines if line.split()}
     if len(words_by_id) < len(lines):
         raise FileFormatError(
             f"{path}: expected each camera once, got one with the same number twice; "
@@ -499,11 +499,8 @@ def _read_opencv(spec: str, entries: Entries) -> CameraModel:
 def _find_opencv_kind(path: str, entries: Entries) -> str:
     """Return the kind of model that a camera of OpenCV or ROS states."""
     keys = ("distortionmodel", "cameramodel", "modeltype")
-    kinds = {
-        _find_kind(path, model)
-        for key in keys
-        if (model := entries.get(key)) is not None
-    }
+    models = [entries.get(key) for key in keys]
+    kinds = {_find_kind(path, model) for model in models if model is not None}
     is_fisheye = not is_neutral(entries.get("fisheyemodel"))
     if len(kinds) > 1:
         raise FileFormatError(
@@ -646,6 +643,7 @@ def _read_binning(entries: Entries) -> tuple[float, float]:
 
     The calibration is that of the pixels before.
     """
+    # ROS writes 0 for no binning, as for 1.
     y_binning = entries.get_number("binning_y", 1.0) or 1.0
     x_binning = entries.get_number("binning_x", 1.0) or 1.0
     for name, pixels in (("binning_y", y_binning), ("binning_x", x_binning)):

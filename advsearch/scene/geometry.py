@@ -259,11 +259,11 @@ def apply_settings(part: MeshPart, values: Mapping[str, float | None]) -> MeshPa
     and so on, and stays on the height that it stands on; without any it stays as it is.
     Its material is set by `material:NAME.roughness` and so on.
     """
-    parameters = {
-        parameter.name: value
-        for parameter in POSE
-        if (value := values.get(f"pose:{part.name}.{parameter.name}")) is not None
-    }
+    parameters = {}
+    for parameter in POSE:
+        value = values.get(f"pose:{part.name}.{parameter.name}")
+        if value is not None:
+            parameters[parameter.name] = value
     if parameters:
         positions = compute_base_vertices(part)
         parameters = {

@@ -433,22 +433,29 @@ def find_surroundings(scene: SceneDescription) -> Surroundings | None:
         return None
     place = find_place(scene)
     extent: Box | float = math.inf if place is None else bound_ground(place)
+    # the place whose picture is in the environment's map
     bundled = PLACE_BY_GROUND_KIND.get(environment.ground or "")
-    backdrop = environment.place if bundled is None else load_bundled_place(*bundled)
-    if place is not None and backdrop is not None and backdrop.file.picture is not None:
-        picture = backdrop.file.picture
+    captured_site = (
+        environment.place if bundled is None else load_bundled_place(*bundled)
+    )
+    if (
+        place is not None
+        and captured_site is not None
+        and captured_site.file.picture is not None
+    ):
+        picture = captured_site.file.picture
         return Surroundings(
-            picture.height,
-            (*picture.x, *picture.y),
-            extent,
-            scene.number("environment.rotation"),
+            height=picture.height,
+            nearest_distance=(*picture.x, *picture.y),
+            ground_extent=extent,
+            rotation=scene.number("environment.rotation"),
         )
     if environment.photographed and (is_paved(scene) or scene.photograph is not None):
         height = scene.capture_height * scene.metres
         radius = scene.values.get("ground.radius")
-        return Surroundings(
-            height, DEFAULT_EMPTY_RADIUS * height if radius is None else radius, extent
-        )
+        if radius is None:
+            radius = DEFAULT_EMPTY_RADIUS * height
+        return Surroundings(height, radius, extent)
     return Surroundings(math.inf, math.inf, extent) if is_paved(scene) else None
 
 
@@ -475,7 +482,9 @@ def make_camera_view(
     pose = camera_to_world(scene) if to_world is None else to_world
     x, y, z = pose[:3, 3] * scene.metres
     forward = pose[:3, 2]
-    half_fov = math.radians(scene.number("camera.fov") if fov is None else fov) / 2.0
+    if fov is None:
+        fov = scene.number("camera.fov")
+    half_fov = math.radians(fov) / 2.0
     half_height_angle = math.degrees(
         math.atan(math.tan(half_fov) * min(1.0, 1.0 / scene.aspect))
     )

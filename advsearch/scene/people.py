@@ -199,6 +199,8 @@ class Person:
         number_by_name = self._complete_values(values)
         device = number_by_name["height"].device
         mixture, scale = self._mix_phenotype(number_by_name)
+        # Of each gender, age, weight and height (g, a, w, h), the factors of r shapes,
+        # each of which moves points p by coordinates c.
         coefficients = torch.einsum(
             "gawh,gawhr->r", mixture, self._get_tensor("shares", device)
         )
@@ -427,20 +429,20 @@ def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
     )
 
 
-def add_walk(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def add_walk(angle_by_name: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the angles with those of the walk added, within each joint's limits."""
-    angle_by_joint = dict(number)
-    phase = torch.deg2rad(number["walk"])
-    stride = number["stride"]
+    angle_by_joint = dict(angle_by_name)
+    phase = torch.deg2rad(angle_by_name["walk"])
+    stride = angle_by_name["stride"]
     for side, phase_shift in (("left", 0.0), ("right", np.pi)):
         for joint, tenths in GAIT.items():
             swing = _compute_gait_angle(tenths, phase, phase_shift)
             angle_by_joint[f"{side}_{joint}"] = (
                 angle_by_joint[f"{side}_{joint}"] + stride * swing
             )
-    angle_by_joint["spine_turn"] = angle_by_joint[
-        "spine_turn"
-    ] + stride * 5.0 * torch.cos(phase)
+    # The chest turns against the pelvis, by 5 degrees.
+    chest_turn = stride * 5.0 * torch.cos(phase)
+    angle_by_joint["spine_turn"] = angle_by_joint["spine_turn"] + chest_turn
     limits = {
         parameter.name: (parameter.low, parameter.high)
         for parameter in PARAMETERS

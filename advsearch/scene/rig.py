@@ -354,10 +354,9 @@ def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
     """
     text = present_text(path, "COLMAP's images", MAX_IMAGES_SIZE)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
-    # every second line has points
-    words_by_id = {
-        words[0]: words for line in lines[::2] if (words := line.split(maxsplit=9))
-    }
+    # Every second line has points.
+    image_lines = [line.split(maxsplit=9) for line in lines[::2]]
+    words_by_id = {words[0]: words for words in image_lines if words}
     if not words_by_id:
         raise FileFormatError(
             f"{path}: expected 2 to {MAX_CAMERAS} different cameras, got none"

@@ -238,14 +238,15 @@ def describe_changed_lights(header: Header, file: str) -> list[str]:
         f"{DIRECTIONAL_LIGHT_DISTANCE:g} object sizes away"
     )
     ranged = "light{s} with a range, which is left out: light reaches beyond it"
-    kinds = {
+    # Each phrase is counted over the lights or cameras for which it holds.
+    phrases = {
         directional: (light.type == "directional" for light in header.lights),
         ranged: (light.range is not None for light in header.lights),
         "camera{s} without perspective: left out": (
             camera.perspective is None for camera in header.cameras
         ),
     }
-    return [f"{file}: {sentence}" for sentence in _count_phrases(kinds)]
+    return [f"{file}: {sentence}" for sentence in _count_phrases(phrases)]
 
 
 def _count_phrases(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
@@ -318,13 +319,13 @@ class GltfSurfaces:
         color, texture = self._make_base_color(material)
         roughness, metallic = self._compute_roughness_and_metallic(material, pieces)
         surface = ImportedSurface(
-            color,
-            texture,
-            clip_to_unit(roughness),
-            clip_to_unit(metallic),
-            self._make_normal_map(material),
-            self._make_emission(material),
-            name,
+            color=color,
+            texture=texture,
+            roughness=clip_to_unit(roughness),
+            metallic=clip_to_unit(metallic),
+            normal_map=self._make_normal_map(material),
+            emission=self._make_emission(material),
+            name=name,
         )
         uvs = [piece.part.uvs for piece in pieces if piece.part.uvs is not None]
         return self._fit_images(surface, material, uvs)
@@ -332,7 +333,12 @@ class GltfSurfaces:
     def _make_base_color(
         self, material: MaterialEntry
     ) -> tuple[Float32Array | None, Float32Array | None]:
-        """Return the base color (3 or 4,) and its texture (H, W, 3 or 4), in sRGB."""
+        """Return the base color (3 or 4,) and its texture (H, W, 3 or 4), in sRGB.
+
+        The factor multiplies the texture; opacity counts only in the modes that have
+        some. The color is None if it is plain white and there is a texture, even one
+        that is missing.
+        """
         entry = material.surface
         stated_factor = entry.baseColorFactor
         if stated_factor is None:
@@ -341,9 +347,12 @@ class GltfSurfaces:
         color_factor = factor[:3]
         has_alpha = material.alphaMode in TRANSPARENT_MODES
         color = linear_to_srgb(color_factor)
+        image_kind: ImageKind = "colours"
+        if has_alpha:
+            image_kind = "colours and alpha"
         texture = self._load_image(
             entry.baseColorTexture,
-            "colours and alpha" if has_alpha else "colours",
+            image_kind,
             f" names the texture {{name}}, which {{why}}; {describe_substitute(color)} "
             "is used instead",
         )
@@ -688,11 +697,12 @@ def _list_instances(header: Header) -> list[tuple[int, int, Float64Array]]:
     nodes.
     """
     poses = sorted(gltf_skeleton.iterate_poses(header), key=lambda item: item[0])
-    return [
-        (node, mesh, pose)
-        for node, pose in poses
-        if (mesh := header.nodes[node].mesh) is not None
-    ]
+    instances = []
+    for node, pose in poses:
+        mesh = header.nodes[node].mesh
+        if mesh is not None:
+            instances.append((node, mesh, pose))
+    return instances
 
 
 def _select_with_faces(
@@ -1006,7 +1016,13 @@ def read_primitive(
     if "NORMAL" in attributes:
         normals = file.read_numbers(attributes["NORMAL"], used_vertices)
     part = ImportedPart(
-        positions, faces, normals, uvs, colors, ImportedSurface(), flat=True
+        vertices=positions,
+        faces=faces,
+        normals=normals,
+        uvs=uvs,
+        colors=colors,
+        surface=ImportedSurface(),
+        flat=True,
     )
     vertex_joints = None
     if is_skinned:

@@ -367,9 +367,8 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
         FileFormatError: a clip is not as the format defines it, or clips are too large.
     """
     header = file.header
-    skins = {
-        skin for node in target_counts if (skin := header.nodes[node].skin) is not None
-    }
+    node_skins = {header.nodes[node].skin for node in target_counts}
+    skins = {skin for skin in node_skins if skin is not None}
     clips = _read_clips(file, target_counts, skins)
     if not (skins or clips or any(target_counts.values())):
         return None
@@ -485,7 +484,7 @@ def _read_track(
     count = len(times) * values_per_key * n_targets
     if output.count != count or output.width != width:
         expected = (
-            f"{count:,} values of {width} number{'s' * (width > 1)} for "
+            f"{count:,} values of {_count_numbers(width)} for "
             f"{len(times):,} keys of a {target_path}"
         )
         raise damaged(path, expected, f"{output.count:,} of {output.width}")
@@ -500,6 +499,11 @@ def _read_track(
                 path, "rotations of a clip that are unit quaternions", "one of length 0"
             )
     return Track(node, target_path, sampler.interpolation, times, keys)
+
+
+def _count_numbers(count: int) -> str:
+    """Return a count of numbers in words, such as "1 number"."""
+    return f"{count} numbers" if count > 1 else f"{count} number"
 
 
 def _read_times(file: GltfFile, index: int) -> Float64Array:

@@ -408,7 +408,7 @@ class MtlReader:
                 Image.fromarray(opacity).resize(size, Image.Resampling.BILINEAR)
             )
             texture = np.concatenate([texture, resized[:, :, None]], axis=2)
-        elif texture is None:
+        elif texture is None:  # the opacity is one number, of a plain color
             color = color_or_grey
         factor_array = np.array([factor], np.float32)
         return replace(

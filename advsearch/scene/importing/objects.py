@@ -136,7 +136,9 @@ def import_object(
         front = find_front(file, header, up)
     else:
         front = FileAxis(check_facing(facing, format_up))
-    return make_object(parts, notes, file, make_safe_name(file), up, front)
+    return make_object(
+        parts, notes, file=file, name=make_safe_name(file), up=up, front=front
+    )
 
 
 def check_facing(facing: str, up: str | None) -> str:

@@ -712,8 +712,10 @@ def _find_scale(values: Float64Array, kind: np.dtype[np.generic]) -> float:
         return 255.0
     if kind.itemsize == 2 or largest <= 65535.0:
         return 65535.0
-    is_signed = kind.kind == "i"
-    return 2.0 ** (8 * kind.itemsize - is_signed) - 1.0
+    n_bits = 8 * kind.itemsize
+    if kind.kind == "i":
+        n_bits -= 1  # the sign
+    return 2.0**n_bits - 1.0
 
 
 def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:

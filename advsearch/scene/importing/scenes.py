@@ -139,21 +139,22 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     asset = make_object(
         object_parts,
         notes,
-        path,
-        f"{make_safe_name(path)}-{sanitize_name(node)}",
-        "y",
-        front,
+        file=path,
+        name=f"{make_safe_name(path)}-{sanitize_name(node)}",
+        up="y",
+        front=front,
     )
     return ImportedScene(asset, tuple(surroundings), cameras)
 
 
 def _find_node_lights(header: Header, nodes: Iterable[int]) -> dict[int, LightEntry]:
     """Return the light of each node that has one."""
-    return {
-        index: header.lights[light_index]
-        for index in nodes
-        if (light_index := header.nodes[index].lamp) is not None
-    }
+    lights = {}
+    for node in nodes:
+        light_index = header.nodes[node].lamp
+        if light_index is not None:
+            lights[node] = header.lights[light_index]
+    return lights
 
 
 def _make_surrounding_meshes(
@@ -260,7 +261,7 @@ def _make_surrounding_mesh(
     the size that it had relative to the object.
     """
     frame = _compute_frame(parts, object_frame.turn)
-    shape = make_object(parts, [], path, name, "y", front)
+    shape = make_object(parts, notes=[], file=path, name=name, up="y", front=front)
     mesh_to_object = np.eye(4)
     mesh_to_object[:3, :3] *= frame.size / object_frame.size
     mesh_to_object[:3, 3] = object_frame.to_frame(frame.origin)
@@ -349,10 +350,14 @@ def contents(path: Path) -> Contents:
     name = make_safe_name(path)
     if path.suffix.lower() not in GLTF_SUFFIXES:
         front = find_front(path, None)
-        return Contents(make_object(parts, notes, path, name, None, front))
+        return Contents(
+            make_object(parts, notes, file=path, name=name, up=None, front=front)
+        )
     header = gltf.read_header(path, data)
     notes += gltf_parts.describe_changed_lights(header, path.name)
-    asset = make_object(parts, notes, path, name, "y", find_front(path, header))
+    asset = make_object(
+        parts, notes, file=path, name=name, up="y", front=find_front(path, header)
+    )
     parts_of_node = _group_by_node(parts)
     mesh_names = _make_mesh_names(header, parts, UniqueNames(RESERVED_NAMES))
     nodes = [

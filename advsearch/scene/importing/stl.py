@@ -129,6 +129,7 @@ def _read_colors(
     if 0 <= magics_position <= 70:
         if b"MATERIAL=" in head:
             notes.record("header entry", "MATERIAL")
+        # Where no facet has any bit set, all have the color of the object.
         has_color = (attributes & _COLOR_FLAG == 0) & bool(attributes.any())
         colors = colors[:, ::-1]
         default_color = np.frombuffer(

@@ -95,6 +95,7 @@ def apply_textures(
     is_uniform = all(surface.has_same_maps(first_surface) for surface in used_surfaces)
     has_uniform_factor = bool((soup.colors == soup.colors[0, 0]).all())
     material = index_materials(soup, surfaces)[1]
+    # First the ways that need no baking; if none is possible, the last one.
     is_lit_twice = False
     if is_uniform and has_uniform_factor:
         if not first_surface.images:
@@ -426,7 +427,8 @@ def bake(
 def _make_blank_maps(surfaces: Sequence[ImportedSurface], size: int) -> SurfaceMaps:
     """Return white, flat and dark maps (N, N, ...), of which surfaces need some."""
     has_opacity = any(_get_base_color(surface).shape[-1] == 4 for surface in surfaces)
-    color = np.ones((size, size, 3 + has_opacity), np.float32)
+    n_channels = 4 if has_opacity else 3
+    color = np.ones((size, size, n_channels), np.float32)
     normals = None
     if any(surface.normal_map is not None for surface in surfaces):
         normals = np.full((size, size, 3), FLAT_TEXEL)

@@ -186,11 +186,11 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         parts.append(
             split_at_corners(
                 group,
-                position,
-                normal,
-                group_uv,
-                tint,
-                surface,
+                points=position,
+                normals=normal,
+                uvs=group_uv,
+                colors=tint,
+                surface=surface,
                 flat=bool(is_flat[first_triangle]),
             )
         )
@@ -597,6 +597,7 @@ class ObjLines:
         if len(digits) != 8 * count:
             return None
         channels = np.frombuffer(bytes.fromhex(digits.decode()), np.uint8)
+        # The first of four is a mask.
         return channels.reshape(-1, 4)[:, 1:].astype(np.float64)
 
     def _select_lines(self, kind: str) -> tuple[IntArray, Bytes]:
@@ -690,6 +691,7 @@ def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntAr
         is_after_two_slashes: whether two slashes, not one, are between a number that is
             not the first and its predecessor.
     """
+    # Slashes between a number and its predecessor in the same corner.
     step = np.where(is_first, 0, np.where(is_after_two_slashes, 2, 1))
     column = step.copy()
     column[1:] += np.where(is_first[1:], 0, step[:-1])

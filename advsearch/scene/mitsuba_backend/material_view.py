@@ -486,10 +486,12 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
         mesh.
     """
     ends, owner, across = _find_edges(mesh.vertices, mesh.corners)
+    # (E, 3) normals of the planes
     plane = torch.linalg.cross(
         mesh.vertices[ends[:, 0]] - eye, mesh.vertices[ends[:, 1]] - eye
     )
     plane = torch.nn.functional.normalize(plane, dim=1)
+    # (3 F,) on which side of its edge's plane the third corner of each face lies
     offset_from_plane = (plane[owner] * (mesh.vertices[across] - eye)).sum(dim=1)
     min_offset = torch.full(
         (len(ends),), torch.inf, dtype=offset_from_plane.dtype
@@ -784,7 +786,9 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     first = along_face(last - n_faces + 1)
     second = along_face(last)
     turned, angle = _measure_between_faces(first, second, axis, is_single)
-    return _ExteriorAngles(ends, axis, first, second, turned, angle)
+    return _ExteriorAngles(
+        ends=ends, axis=axis, first=first, second=second, turned=turned, angle=angle
+    )
 
 
 def _measure_between_faces(

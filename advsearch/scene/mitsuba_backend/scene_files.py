@@ -332,17 +332,16 @@ def _paint(
         uvs = (file_uvs * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
         return replace(mesh, uvs=uvs), surface.base_color
     keeps_uvs = has_uvs and kind not in ("cube", "sphere", "cylinder", "disk")
-    color = ImportedSurface(color=surface.base_color[0, 0])
+    surface_color = ImportedSurface(color=surface.base_color[0, 0])
     part = ImportedPart(
-        mesh.vertices.astype(np.float64),
-        mesh.faces.astype(np.int64),
-        mesh.normals.astype(np.float64),
-        mesh.uvs.astype(np.float64) if keeps_uvs else None,
-        None,
-        color,
+        vertices=mesh.vertices.astype(np.float64),
+        faces=mesh.faces.astype(np.int64),
+        normals=mesh.normals.astype(np.float64),
+        uvs=mesh.uvs.astype(np.float64) if keeps_uvs else None,
+        surface=surface_color,
     )
     soup, maps = apply_textures(
-        join_parts([part], where, np.eye(3)), [color], Notes(where)
+        join_parts([part], where, np.eye(3)), [surface_color], Notes(where)
     )
     return assemble(soup)[0], maps.color
 

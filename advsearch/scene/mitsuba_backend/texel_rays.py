@@ -324,7 +324,11 @@ def compute_map_position(direction: Any, to_local: Any) -> tuple[Any, Any]:
 
 
 def compute_grid_position(grid: TexelGrid, position: Any, uv: Any) -> tuple[Any, Any]:
-    """Return where in a grid something lies: fractions of its height and its width."""
+    """Return where in a grid something lies: fractions of its height and its width.
+
+    On a mesh that is by its texture coordinates, which repeat; on a plane by the
+    inverse of the grid's warp, and at its border further out.
+    """
     if grid.warp is None:
         return uv.y - dr.floor(uv.y), uv.x - dr.floor(uv.x)
     center_x, center_y, scale, rate = grid.warp
@@ -386,7 +390,9 @@ class Lobes:
         """Return those of a diffuse surface."""
         ones = np.ones(N_ANGLES, dtype=np.float32)
         zeros = np.zeros(N_ANGLES, dtype=np.float32)
-        return cls(ones, zeros, ones, zeros, zeros, zeros)
+        return cls(
+            diffuse=ones, gloss=zeros, up=ones, along=zeros, core=zeros, tail=zeros
+        )
 
     @property
     def mean_reflectances(self) -> tuple[float, float]:

@@ -219,12 +219,12 @@ def _fetch_paths(
         image, [3, 1, 3, 3, 3], dim=-1
     )
     return Paths(
-        radiance.contiguous(),
-        coverage.contiguous(),
-        background.contiguous(),
-        albedo.contiguous(),
-        normal.contiguous(),
-        [
+        radiance=radiance.contiguous(),
+        coverage=coverage.contiguous(),
+        background=background.contiguous(),
+        albedo=albedo.contiguous(),
+        normal=normal.contiguous(),
+        vertices=[
             _fetch_vertices(*vertex, mask, spp)
             for vertex, mask in zip(vertices, has_weight, strict=True)
         ],

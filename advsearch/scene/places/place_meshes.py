@@ -491,8 +491,7 @@ def _join(members: Sequence[ImportedPart]) -> Mesh:
     n_vertices = 0
     for part in map(_with_normals, members):
         part_normals = part.normals
-        if part_normals is None:
-            part_normals = np.zeros_like(part.vertices)
+        assert part_normals is not None
         part_uvs = part.uvs
         if part_uvs is None:
             part_uvs = np.zeros((len(part.vertices), 2))

@@ -223,11 +223,11 @@ class Arrangement:
         met_cells = trace_texel_rays(
             scene,
             self.texels.grids,
-            texels.SKY_SHAPE,
-            self.texels.positions,
-            self.texels.normals,
-            RAYS_PER_TEXEL,
-            seed,
+            sky_shape=texels.SKY_SHAPE,
+            positions=self.texels.positions,
+            normals=self.texels.normals,
+            n_rays=RAYS_PER_TEXEL,
+            seed=seed,
         )
         self._view_matrices = texels.make_view_matrices(
             met_cells, self.texels.texel_of_cell, len(self.texels.positions)
@@ -240,7 +240,7 @@ class Arrangement:
                     charts,
                     self.fine_shape,
                     vertices,
-                    (1 - 2 * side) * normals,
+                    normals if side == 0 else -normals,
                     self._find_buried(met_cells, side),
                 )
             )
@@ -260,10 +260,10 @@ class Arrangement:
             scene,
             self.texels.grids,
             self.lobes,
-            texels.BLUR_WIDTHS,
-            self._capture_height,
-            model,
-            object_center,
+            widths=texels.BLUR_WIDTHS,
+            photograph_height=self._capture_height,
+            model=model,
+            center=object_center,
         )
 
     def _refine(self, texture: tuple[int, int]) -> None:

@@ -282,7 +282,13 @@ def make_lookup_matrix(
     )
 
     texel_index, weights = _weigh_neighbours(
-        texels, charts, grid_position, points, point_normals, texel_width, buried
+        texels,
+        charts,
+        grid_position=grid_position,
+        points=points,
+        normals=point_normals,
+        texel_width=texel_width,
+        buried=buried,
     )
     _use_nearest_texel(texels, charts, grid_position, texel_index, weights)
     weights /= weights.sum(axis=1, keepdims=True)

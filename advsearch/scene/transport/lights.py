@@ -429,7 +429,7 @@ class BasisRenderer(Predictor):
                         u,
                         noise_seed,
                         tick,
-                        names=base_colors if index else linear,
+                        names=linear if index == 0 else base_colors,
                         light=light_inputs,
                     )
                 )

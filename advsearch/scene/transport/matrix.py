@@ -506,7 +506,14 @@ class LinearRenderer(Predictor):
         if collected is None:
             with torch.no_grad():
                 collected = _collect(
-                    traced.copy_with(), u, seed, tick, spp, quick, names, light
+                    renderer=traced.copy_with(),
+                    u=u,
+                    seed=seed,
+                    tick=tick,
+                    spp=spp,
+                    quick=quick,
+                    names=names,
+                    light=light,
                 )
         self.collected = collected
         self.non_finite = collected.non_finite

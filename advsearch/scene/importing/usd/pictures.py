@@ -103,12 +103,10 @@ def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
             return np.stack([grey, grey, grey, np.ones_like(grey)], axis=2)
         if _is_png_of_16_bits(data):
             return _decode_png_of_16_bits(data, image.size)
+        # Numbers are averaged down later, as they are.
+        limit = MAX_SIDE if is_srgb else None
         return reading.pictures.load_display_image(
-            image,
-            MAX_SIDE if is_srgb else None,
-            path,
-            keep_alpha=True,
-            is_raw=not is_srgb,
+            image, limit, path, keep_alpha=True, is_raw=not is_srgb
         )
 
 

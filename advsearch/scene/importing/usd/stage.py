@@ -56,7 +56,9 @@ def main(source: str, target: str, folder: str) -> None:
     stage = Usd.Stage.Open(str(file))
     conversion = Conversion(stage, file.parent.resolve(), Path(source).name, layers)
     Path(target).write_bytes(conversion.convert())
-    print(json.dumps(conversion.files_read if file == Path(source) else []))
+    # Files of a package are temporary.
+    files_read = conversion.files_read if file == Path(source) else []
+    print(json.dumps(files_read))
 
 
 # ---- The stage ----
