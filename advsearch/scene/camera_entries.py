@@ -323,7 +323,11 @@ def make_camera_model(
 def _check_numbers(
     path: str, value_by_name: Mapping[str, float], width: float, height: float
 ) -> None:
-    """Raise FileFormatError if numbers in pixels are those of no camera."""
+    """Raise FileFormatError if numbers in pixels are those of no camera.
+
+    Focal lengths within a factor of a thousand of the image's sides, a principal point
+    inside of the image, a skew up to fx, and coefficients up to `MAX_COEFFICIENT`.
+    """
 
     def check(name: str, is_valid: bool, expected: str, hint: str = "") -> None:
         """Raise the error of a number that is not valid."""

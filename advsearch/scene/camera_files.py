@@ -173,8 +173,8 @@ def read_camera(spec: str) -> CameraModel:
 
     Raises:
         FileFormatError: the file is missing, is of no known kind, has a model that is
-        not one of ours, numbers that no camera has, or an entry that changes the image
-        and is not read.
+            not one of ours, numbers that no camera has, or an entry that changes the image
+            and is not read.
     """
     path, _, camera_name = spec.partition("#")
     suffix = Path(path).suffix.lower()
@@ -237,7 +237,11 @@ def _flatten_groups(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _parse_file(path: str, text: str) -> dict[str, Any]:
-    """Parse a camera file that is XML, JSON or YAML."""
+    """Parse a camera file that is XML, JSON or YAML.
+
+    Of a YAML file with several documents the first counts. Raises FileFormatError if it
+    is no mapping of names.
+    """
     if text.lstrip().startswith("<"):
         return _parse_xml(path, text)
     if path.lower().endswith(".json"):
@@ -259,7 +263,11 @@ def _parse_file(path: str, text: str) -> dict[str, Any]:
 
 
 def _parse_xml(path: str, text: str) -> dict[str, Any]:
-    """Parse a camera of OpenCV or Metashape in XML."""
+    """Parse a camera of OpenCV or Metashape in XML.
+
+    A matrix becomes the list of its words, an element with others in it a dictionary,
+    and any other its text. Raises FileFormatError for other XML.
+    """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise FileFormatError(
             f"{path}: declares a document type or entities, "
@@ -290,7 +298,11 @@ def _parse_xml(path: str, text: str) -> dict[str, Any]:
 def _read_colmap(
     spec: str, path: str, camera_name: str, lines: Sequence[str]
 ) -> CameraModel:
-    """Return the model of a camera of COLMAP's cameras.txt."""
+    """Return the model of a camera of COLMAP's cameras.txt.
+
+    A line has CAMERA_ID, MODEL, WIDTH, HEIGHT and the model's parameters; one focal
+    length stands for both.
+    """
     words_by_id = {line.split()[0]: line.split() for line in lines if line.split()}
     if len(words_by_id) < len(lines):
         raise FileFormatError(
@@ -327,7 +339,11 @@ def _read_colmap(
 def _read_nerfstudio(
     spec: str, camera_name: str, data: Mapping[str, Any]
 ) -> CameraModel:
-    """Return the model of a transforms.json, or of one of its frames."""
+    """Return the model of a transforms.json, or of one of its frames.
+
+    Entries of the frame win over those of all; the principal point is the center by
+    default.
+    """
     path = spec.partition("#")[0]
     frames = _list_frames(data)
     lens = _select_lens(path, camera_name, frames)
@@ -458,7 +474,12 @@ def _read_kalibr(
 
 
 def _read_opencv(spec: str, entries: Entries) -> CameraModel:
-    """Return the model of a camera of OpenCV or ROS."""
+    """Return the model of a camera of OpenCV or ROS.
+
+    Principal points count from the center of the first pixel. The calibration is of the
+    sensor's pixels, before ROS bins them: the model has the size after that. A tilted
+    sensor is rejected, a region of interest too.
+    """
     path = entries.path
     kind = _find_opencv_kind(path, entries)
     if kind == EQUIRECTANGULAR:

@@ -141,7 +141,7 @@ def add_lamps(scene: SceneDescription) -> SceneDescription:
 
     Raises:
         InputError: the light of the environment has no unit, the object's size is not
-        known, or a name is taken.
+            known, or a name is taken.
     """
     others = tuple(
         part for part in scene.parts if not isinstance(part, (BeamLamp, LampGlass))

@@ -326,9 +326,9 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
 
     Raises:
         FileFormatError: the file is missing, of another kind, damaged, or lacks
-        channels; the message names it.
+            channels; the message names it.
         InputError: values are negative, NaN or infinite; the message counts them and
-        gives the first position.
+            gives the first position.
     """
     file = Path(path)
     picture = read_light(file)

@@ -155,11 +155,15 @@ class Person:
         data: Mapping[str, np.ndarray],
         defaults: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
+        """Convert the arrays to tensors, and pose the person at its defaults."""
         usual = {parameter.name: float(parameter.default) for parameter in PARAMETERS}
         self.data = data
         self.defaults = usual | dict(defaults)
         self._bones = [str(bone) for bone in data["bones"]]
         self._parents = [int(parent) for parent in data["parents"]]
+        # `mean` (P, 3) are points in tenths of a millimetre, `basis` (R, P, 3) the
+        # shapes, `shares` (G, A, W, H, R) their factors in each extreme body, with
+        # `stature` and `mass`, and `index` the point of each vertex.
         weight_sums = data["weights"].sum(axis=1, keepdims=True, dtype=np.float32)
         self._tensors = {
             "mean": torch.from_numpy(data["mean"].astype(np.float32) * 1e-4),
@@ -169,6 +173,8 @@ class Person:
         } | {
             name: torch.from_numpy(data[name]) for name in ("shares", "stature", "mass")
         }
+        # Points of the left and of the right shoe; `points` is how many vertices each
+        # piece of clothing has, and `tags` what it is.
         is_shoe = np.repeat(data["tags"], data["points"]) == "shoes"
         shoe_points = np.unique(data["index"][is_shoe].astype(np.int64))
         is_left = data["mean"][shoe_points, 1] > 0

@@ -378,6 +378,7 @@ class MeshSurface:
     """
 
     def __init__(self, mesh: Mesh) -> None:
+        """Compute boxes and normals of the faces, and which faces are neighbours."""
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _compute_face_normals(mesh)
         self._lower = self._corners.min(axis=1)

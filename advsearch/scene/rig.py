@@ -241,7 +241,11 @@ def _to_rows(value: Any) -> list[list[Any]]:
 
 
 def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
-    """Return the cameras of Kalibr's camchain; empty if it has no extrinsics."""
+    """Return the cameras of Kalibr's camchain; empty if it has no extrinsics.
+
+    Cameras are in the order of their numbers; each but the first states its transform
+    from the one before.
+    """
     cameras = {
         name: camera
         for name, camera in data.items()
@@ -266,7 +270,11 @@ def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
 
 
 def _read_transforms(path: str, frame_names: str) -> tuple[Mount, ...]:
-    """Return frames of nerfstudio's transforms.json as cameras."""
+    """Return frames of nerfstudio's transforms.json as cameras.
+
+    `frame_names` are their indices, with commas. Positions are divided by the scale
+    that the file has applied.
+    """
     text = present_text(path, "a camera file", MAX_JSON_SIZE)
     data = parsed(path, text, "JSON", parse_json)
     frames = data.get("frames") if isinstance(data, dict) else None
@@ -378,7 +386,12 @@ def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
 
 
 def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
-    """Return the pose (4, 4), from the camera to the world, of an image of COLMAP."""
+    """Return the pose (4, 4), from the camera to the world, of an image of COLMAP.
+
+    `words` are its line: the id, a quaternion with the real part first, a shift, from
+    the world to the camera, the camera's id and the file. Raises FileFormatError for
+    others.
+    """
     if len(words) != 10:
         raise FileFormatError(
             f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got "

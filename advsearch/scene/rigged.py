@@ -104,8 +104,12 @@ class SkeletonRig:
     def __init__(
         self, parts: Sequence[Movable], vertices: IntArray, to_mesh: Float64Array
     ) -> None:
+        """Bring the arrays of all parts into the order of the mesh's vertices, as
+        tensors.
+        """
         self.skeleton = parts[0].skeleton
         self._to_mesh = torch.from_numpy(to_mesh)
+        # without the scale
         self._rotation_to_mesh = torch.from_numpy(
             to_mesh / np.cbrt(np.linalg.det(to_mesh))
         )
@@ -125,6 +129,7 @@ class SkeletonRig:
             ]
         )
         weights = np.concatenate([pad_joints(part.weights) for part in parts])
+        # Of each vertex: where it is, its joints (rows of `_nodes`) and their weights.
         self._points = torch.from_numpy(points[vertices])
         self._joints = torch.from_numpy(joints[vertices])
         self._weights = torch.from_numpy(weights[vertices])
@@ -143,7 +148,7 @@ class SkeletonRig:
         # The rotation nearest to each node's matrix in the scene, without its scale and
         # shear.
         world = self._compute_world(self._local_matrices)[:, :3, :3].numpy()
-        left, _, right = np.linalg.svd(world)
+        left, _, right = np.linalg.svd(world)  # polar decomposition
         self._axes = torch.from_numpy(left @ right)
         self._rest = self.pose({})
 

@@ -587,7 +587,7 @@ def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
 
     Raises:
         InputError: a value is not a finite number inside its range, or two settings
-        contradict each other.
+            contradict each other.
         UnknownNameError: a name is not a setting.
     """
     if "camera.elevation" in settings and "camera.height" in settings:

@@ -141,6 +141,7 @@ def _find_patches(soup: Soup) -> IntArray:
     normals: Float64Array = normalize_vectors(soup.face_vectors())
     count = len(normals)
     left, right, _ = find_shared_edges(soup.faces)
+    # faces of both corners (3 face + k) of an edge
     face = left // 3
     neighbour = right // 3
     is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
@@ -237,6 +238,7 @@ class SurfaceParts:
     """
 
     def __init__(self, mesh: Mesh) -> None:
+        """Rasterise the map, and find the center of each cell and of each face."""
         self.mesh = mesh
         self._mesh_uvs = mesh.uvs[mesh.faces].astype(np.float64)
         self.is_unwrapped = not _has_unique_uvs(mesh, self._mesh_uvs)
@@ -322,7 +324,11 @@ def _rasterise_map(mesh: Mesh, uvs: Float64Array) -> Charts:
 
 
 def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
-    """Return whether texture coordinates (F, 3, 2) tell points of a surface apart."""
+    """Return whether texture coordinates (F, 3, 2) tell points of a surface apart.
+
+    They lie in the unit square, give almost all of the surface an area, cover enough of
+    the square, and hardly any of it twice.
+    """
     if uvs.min() < 0.0 or uvs.max() > 1.0:
         return False
     corners = mesh.vertices[mesh.faces].astype(np.float64)

@@ -174,7 +174,7 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
 
     Raises:
         FileFormatError: the file has another suffix, or is missing, not an ordinary
-        file, unreadable, empty or larger than `LARGEST_FILE`.
+            file, unreadable, empty or larger than `LARGEST_FILE`.
     """
     try:
         _check_suffix(path, what, suffixes)

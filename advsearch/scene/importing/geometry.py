@@ -256,7 +256,11 @@ def assemble(soup: Soup) -> tuple[Mesh, IntArray | None]:
 
 
 def _fix_winding(soup: Soup, notes: Notes) -> Soup:
-    """Return the soup with consistent and outward winding, and note the changes."""
+    """Return the soup with consistent and outward winding, and note the changes.
+
+    Faces wound against their neighbours are turned over first, then shells that are
+    inside out.
+    """
     is_turned, shell, has_moebius_strip = _find_turned_faces(soup)
     if is_turned.any():
         notes.warn(
@@ -710,6 +714,7 @@ class _EarCutter:
     """
 
     def __init__(self, flat: Float64Array) -> None:
+        """Start with all corners of all polygons, the first of which is tried first."""
         count, n_corners = flat.shape[:2]
         corner = np.arange(n_corners)
         self.flat = flat
@@ -720,6 +725,7 @@ class _EarCutter:
         self.tip = np.zeros(count, dtype=np.int64)
         self.n_tries = np.zeros(count, dtype=np.int64)
         self.is_failed = np.zeros(count, dtype=np.bool_)
+        # areas of the triangles from the origin to each side add up to the polygon's
         successors = np.roll(flat, -1, axis=1)
         doubled_areas = _compute_doubled_areas(flat, successors, np.zeros(2))
         self.area = np.abs(doubled_areas.sum(axis=1))

@@ -141,7 +141,11 @@ def _find_extensions(path: Path, content: JsonValue) -> set[str]:
 
 
 def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
-    """Return the JSON of a file, and the binary chunk of a .glb file or None."""
+    """Return the JSON of a file, and the binary chunk of a .glb file or None.
+
+    A .glb has 12 bytes of header, then chunks with 8 bytes of header each (glTF 2.0,
+    section 4.4). Raises FileFormatError if it is shorter than it states.
+    """
     if path.suffix.lower() == ".gltf":
         return data, None
     has_magic = data.startswith(b"glTF")
@@ -443,7 +447,11 @@ class GltfFile:
         return memoryview(data)[view.byteOffset : end]
 
     def _load_buffer(self, index: int) -> bytes:
-        """Return the bytes of a buffer, which are loaded on first use."""
+        """Return the bytes of a buffer, which are loaded on first use.
+
+        They are those of its URI, or for the first buffer of a .glb file its binary
+        chunk. Raises FileFormatError if there are none.
+        """
         if index in self._buffers:
             return self._buffers[index]
         uri = self.header.buffers[index].uri

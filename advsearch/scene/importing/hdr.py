@@ -175,7 +175,11 @@ def _check_planes(
 
 
 def _check_size(file: Path, picture: Any) -> None:
-    """Raise FileFormatError for a picture that is deep, or over a limit."""
+    """Raise FileFormatError for a picture that is deep, or over a limit.
+
+    The limit is on the values of all parts, and on the display window of each, which
+    may be larger than its data.
+    """
     n_values = 0
     for part in picture.parts:
         header = part.header

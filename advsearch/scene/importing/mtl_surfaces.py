@@ -502,7 +502,11 @@ class MtlReader:
     def _make_emission(
         self, material: MtlMaterial, use: MapUse | None
     ) -> Float32Array | None:
-        """Return the radiance of ``Ke`` and ``map_Ke``, (H, W, 3), or None."""
+        """Return the radiance of ``Ke`` and ``map_Ke``, (H, W, 3), or None.
+
+        They are multiplied; without a map the radiance is (1, 1, 3). A map that cannot
+        be read leaves no emission, with a note.
+        """
         values = parse_numbers(material.read_argument("ke") or "0")
         if values is None or len(values) not in (1, 3) or min(values) < 0:
             self.notes.warn(

@@ -122,7 +122,11 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
 def _parse_header(
     header: str, notes: Notes
 ) -> tuple[dict[str, Element], list[str], str]:
-    """Return the elements, the comments and the byte order, empty for ASCII."""
+    """Return the elements, the comments and the byte order, empty for ASCII.
+
+    A property belongs to the element before it; its type has the byte order of the
+    format, which stands first. Raises FileFormatError for any other line.
+    """
     elements: dict[str, Element] = {}
     comments = list[str]()
     byte_order = None
@@ -373,7 +377,10 @@ def _combine_colors(
 def _make_parts(
     reader: _Properties, points: Float64Array, texture_names: Sequence[str]
 ) -> list[ImportedPart]:
-    """Return the faces of a file as parts, given its points (N, 3) and textures."""
+    """Return the faces of a file as parts, given its points (N, 3) and textures.
+
+    A part for each texture, and others for faces without texture coordinates.
+    """
     notes = reader.notes
     corners, corner_counts = reader.read_polygons(len(points))
     triangles, polygon = triangulate_and_note(points[corners], corner_counts, notes)

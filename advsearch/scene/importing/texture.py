@@ -230,7 +230,11 @@ def _describe_reason(
     is_uniform: bool,
     has_uniform_factor: bool,
 ) -> str:
-    """Return the reason why an object was baked, as a sentence for its warnings."""
+    """Return the reason why an object was baked, as a sentence for its warnings.
+
+    The first that holds of: several materials or pictures, colors of vertices, missing
+    texture coordinates, unusable ones.
+    """
     if not is_uniform:
         n_materials = len({surface.name or id(surface) for surface in used})
         if n_materials > 1:

@@ -35,6 +35,7 @@ class TrackedKeys(Generic[T]):
         fold: Callable[[str], str] = str,
         prefix: str = "",
     ) -> None:
+        """Fold all keys; `prefix` stands before them in what is unread."""
         # Keys, as spelled, that a later one of the same form hides.
         self.repeated: list[str] = []
         self._fold = fold

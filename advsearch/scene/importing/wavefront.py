@@ -264,7 +264,12 @@ def _find_material(
     has_colors: bool,
     names_libraries: bool,
 ) -> MtlSurface:
-    """Return the material of a name, or a plain one and a note if there is none."""
+    """Return the material of a name, or a plain one and a note if there is none.
+
+    Without a name the surface is plain, and nothing is noted. `square_number` is the
+    UDIM square; `names_libraries` is whether the file names material files, of which
+    then a note says that none could be read.
+    """
     if not name:
         return MtlSurface(ImportedSurface())
     mtl_surface = reader.get_surface(name, square_number)
@@ -428,6 +433,7 @@ class ObjLines:
     """
 
     def __init__(self, data: bytes, notes: Notes) -> None:
+        """Find the lines of a file, and the kind of each by its first bytes."""
         if b"\x00" in data:
             raise notes.damaged(EXPECTED, data)
         text = _normalize_lines(data)
@@ -625,7 +631,11 @@ class ObjLines:
             yield int(row) + 1, line.partition("#")[0].split()[1:]
 
     def _raise_for_faces(self, rows: IntArray) -> NoReturn:
-        """Raise FileFormatError for the first face that has a wrong index."""
+        """Raise FileFormatError for the first face that has a wrong index.
+
+        An index is a whole number that is not 0, and no further back than the rows
+        before the face's line.
+        """
         counts_before_line = np.stack(
             [np.cumsum(self.kind == KINDS.index(kind)) for kind in TABLES], axis=1
         )

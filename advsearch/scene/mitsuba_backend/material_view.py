@@ -138,6 +138,7 @@ class FilmView:
         cotangent: Tensor,
         max_depth: int,
     ) -> None:
+        """Sort the scene's meshes into those that move and others, as `TriMesh`."""
         self.scene = scene
         self.camera = Camera(sensor)
         self.max_depth = max_depth
@@ -154,6 +155,7 @@ class FilmView:
                 mesh = _make_mesh(shape, parameters, positions, normals)
                 dr.enable_grad(mesh.positions, mesh.normals)
                 moving_meshes[vertices_name] = mesh
+            # A single rectangle, of two faces, is left out, such as the ground.
             elif shape.is_mesh() and shape.face_count() > 2:
                 buffer = parameters[f"{shape.id()}.{POSITIONS}"]
                 positions = buffer.torch().reshape(-1, 3).clone()

@@ -519,6 +519,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     """
 
     def __init__(self, props: Any) -> None:
+        """Read the model, the clipping and perhaps drops from the sensor's properties."""
         super().__init__(props)
         values = tuple(float(props[name]) for name in NUMBER_NAMES)
         self._model = CameraModel(

@@ -493,7 +493,11 @@ def make_scene_dict(
 
 
 def _make_ground(description: SceneDescription) -> Any:
-    """Return the ground: a photographed one, a plain one, or None."""
+    """Return the ground: a photographed one, a plain one, or None.
+
+    A plain one is a two-sided square of `ground.size`; a road or a place has meshes of
+    its own instead.
+    """
     photograph = description.photograph
     if photograph is not None:
         surface = meshes.make_diffuse(photograph.base_color.numpy())
@@ -550,7 +554,7 @@ def _make_lens(description: SceneDescription) -> Plugin:
 
     Raises:
         InputError: a plain background with raindrops, or with a lens that leaves parts
-        of the image black.
+            of the image black.
     """
     model = description.camera_model
     drops = description.number("camera.drops")

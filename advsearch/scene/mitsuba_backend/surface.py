@@ -135,6 +135,7 @@ class ViewTracer:
         model: CameraModel | None,
         center: Float32Array,
     ) -> None:
+        """Prepare the tables of all surfaces and of the lens for the kernel."""
         self._scene = scene
         self._grids = tuple(grids)
         self._widths = tuple(widths)
@@ -506,7 +507,10 @@ class ViewTracer:
         return radiance
 
     def _look_up_texel(self, si: Any, masks: Sequence[Any], lit: LightMaps) -> Any:
-        """Return what the texels around a hit have, bilinear; 0 on no grid."""
+        """Return what the texels around a hit have, bilinear; 0 on no grid.
+
+        `masks` tell, for each grid, whether the hit is on it.
+        """
         first_cell = mi.UInt32(0)
         n_rows = mi.UInt32(1)
         n_columns = mi.UInt32(1)

@@ -208,7 +208,15 @@ def _fetch_paths(
     size: tuple[int, int],
     spp: int,
 ) -> Paths:
-    """Evaluate the kernel of a pass and fetch images and vertices into torch."""
+    """Evaluate the kernel of a pass and fetch images and vertices into torch.
+
+    Args:
+        channels: of the radiance and of the other images of `Paths`, in their order,
+            for each sample.
+        vertices: texture coordinates, weight and sharpness of each vertex.
+        size: height and width of the image.
+        spp: samples per pixel, which follow one another.
+    """
     n_samples = size[0] * size[1] * spp
     has_weight = _find_weighted_samples(vertices, n_samples)
     dr.eval(channels, vertices, has_weight)  # one kernel for the whole path

@@ -166,7 +166,11 @@ class _SceneText:
     def _set_handlers(
         self, parser: expat.XMLParserType, tree: ElementTree.TreeBuilder
     ) -> None:
-        """Have a parser build a tree and refuse what no scene needs."""
+        """Have a parser build a tree and refuse what no scene needs.
+
+        Document types, entities and the elements alias and path; and more elements, or
+        deeper ones, than the limits. What stands outside of the root is left out.
+        """
         depth = 0
 
         def refuse(*_: object) -> None:
@@ -224,7 +228,10 @@ class _SceneText:
         element[:] = children
 
     def _include(self, name: str) -> list[ElementTree.Element]:
-        """Return the elements of another file."""
+        """Return the elements of another file: those in its scene, or its single one.
+
+        Raises FileFormatError if it may not be read, or too many are included.
+        """
         self.included += 1
         if self.included > MAX_INCLUDES:
             raise FileFormatError(
@@ -449,7 +456,12 @@ class _FileReader:
         }
 
     def check(self, plugin: Mapping[str, object]) -> Plugin:
-        """Return a plugin with all in it checked and read."""
+        """Return a plugin with all in it checked and read.
+
+        Raises FileFormatError for a plugin that does not come with Mitsuba, for a file
+        that only Mitsuba reads, and for the name of a material that is no single word:
+        Mitsuba makes the name of a file of it.
+        """
         kind = str(plugin["type"])
         if kind not in STOCK_PLUGINS:
             raise FileFormatError(

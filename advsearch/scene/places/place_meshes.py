@@ -411,30 +411,24 @@ def _group_by_material(
 
 def _name_material(header: Header, index: int | None) -> str:
     """Return the name of a material by its index, or one for a material without."""
-    return (
-        UNNAMED
-        if index is None
-        else header.materials[index].name or f"material {index}"
-    )
+    if index is None:
+        return UNNAMED
+    return header.materials[index].name or f"material {index}"
 
 
 def _make_part(
     path: Path, name: str, members: Sequence[ImportedPart], surface: ImportedSurface
 ) -> MeshPart:
     """Return one mesh of a place from its parts and their surface."""
-    color = (
-        np.full(3, NEUTRAL_GREY, np.float32) if surface.color is None else surface.color
-    )
-    texture_or_color = (
-        np.broadcast_to(color, (2, 2, len(color)))
-        if surface.texture is None
-        else surface.texture
-    )
-    opacity = (
-        np.ascontiguousarray(texture_or_color[..., 3])
-        if texture_or_color.shape[-1] == 4
-        else None
-    )
+    color = surface.color
+    if color is None:
+        color = np.full(3, NEUTRAL_GREY, np.float32)
+    texture = surface.texture
+    if texture is None:
+        texture = np.broadcast_to(color, (2, 2, len(color)))
+    opacity = None
+    if texture.shape[-1] == 4:
+        opacity = np.ascontiguousarray(texture[..., 3])
     try:
         mesh = _join(members)
     except InputError as error:  # which knows of no file
@@ -442,7 +436,7 @@ def _make_part(
     return MeshPart(
         name=name,
         mesh=mesh,
-        base_color=np.ascontiguousarray(texture_or_color[..., :3]),
+        base_color=np.ascontiguousarray(texture[..., :3]),
         material=Material().with_values(vars(surface), ""),
         opacity=opacity,
         normal_map=surface.normal_map,
@@ -453,7 +447,12 @@ def _make_part(
 def _with_finish(
     path: Path, header: Header, index: int | None, part: MeshPart
 ) -> MeshPart:
-    """Return a mesh with the specular and the clear coat of its material."""
+    """Return a mesh with the specular and the clear coat of its material.
+
+    Specular is so large that the surface reflects as much as by its index of refraction
+    when it faces the light. The gloss of a coat needs a surface in Mitsuba's words; a
+    mesh with cut-outs or bumps has none, and its coat has Mitsuba's own gloss.
+    """
     entry = MaterialEntry() if index is None else header.materials[index]
     finish = _read_extension(path, _Finish, entry.extensions)
     ior = finish.KHR_materials_ior.ior

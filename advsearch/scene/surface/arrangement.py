@@ -76,6 +76,7 @@ class SurfaceView:
         shape: tuple[int, int],
         sides: int = 1,
     ) -> None:
+        """Make the matrix of one camera's samples: four entries for each ray that hits."""
         self.base_radiance = samples.radiance[camera_index]
         self.coverage = samples.coverage[camera_index]
         height, width = self.base_radiance.shape[:2]
@@ -85,6 +86,8 @@ class SurfaceView:
         bounds = torch.tensor([camera_index, camera_index + 1]) * n_rays
         begin, end = torch.searchsorted(samples.sample, bounds).tolist()
         pixel = (samples.sample[begin:end] - first_sample) // RAYS_PER_PIXEL
+        # (n, 4) cells and weights of the bilinear look-ups; those on the back are in
+        # the second half of the columns.
         columns, fractions = find_bilinear_weights(samples.uv[begin:end].numpy(), shape)
         is_back = samples.is_back[begin:end].numpy()
         columns += np.int32(n_cells) * is_back[:, None]
@@ -196,6 +199,7 @@ class Arrangement:
         texture: tuple[int, int],
         seed: int,
     ) -> None:
+        """Lay texels over all surfaces, trace what they see, and measure how they look."""
         scene = renderer.scene
         self._scene = scene
         self.inputs = {
@@ -209,6 +213,8 @@ class Arrangement:
         charts = rasterize_charts(description.meshes[OBJECT].mesh, OBJECT_TEXELS)
         surfaces = self._texels_on_object(charts, vertices, normals)
         self.n_sides = len(surfaces)
+        # The ground goes on from the center of the object; a photographed one shows
+        # what was taken from `capture_height`.
         photograph = description.photograph
         self._has_ground = description.number("ground.size") > 0.0
         if self._has_ground:
@@ -220,6 +226,8 @@ class Arrangement:
         self.texels: texels.LitTexels = texels.join_texels(surfaces)
         self._refine(texture)
 
+        # What texels see of the sky and of each other, as matrices; and matrices from
+        # the light on the object's texels to the fine grid, side by side.
         met_cells = trace_texel_rays(
             scene,
             self.texels.grids,
@@ -246,6 +254,7 @@ class Arrangement:
             )
         if self._has_ground:
             self._smooth = self._make_ground_smoothing(surfaces[-1], met_cells)
+        # Gloss: both sides of the object have the same, and the ground has none.
         self.lobes = [self._measure_object()] * self.n_sides
         self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
         self._capture_height = (

@@ -104,6 +104,7 @@ class SurfaceRenderer(Predictor):
     n_traced_images = 0
 
     def __init__(self, traced: Renderer, u: Tensor, seed: int) -> None:
+        """Fix everything as it is at u but cameras, environment and base color."""
         super().__init__(traced)
         self.n_dropped = 0
         self.stored_lights: dict[MapFingerprint, ArrangementLight] = {}

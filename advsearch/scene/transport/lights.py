@@ -323,6 +323,9 @@ class LightBasis:
     """
 
     def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
+        """Split the light of the inputs: what stays, lamps that change, the
+        environment.
+        """
         patterns = {
             name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
         }
@@ -333,6 +336,7 @@ class LightBasis:
             else renderer.scene.get_base_value(name)
             for name in sorted(names)
         }
+        # In the inputs of a light all others are dark.
         dark = {name: torch.zeros_like(value) for name, value in values.items()}
         changed_names = lighting.changed_inputs
         fixed_values = {
@@ -407,6 +411,9 @@ class BasisRenderer(Predictor):
         *,
         changing: Lighting | None = None,
     ) -> None:
+        """Trace a basis image for each light, with the matrices of base colors under
+        it.
+        """
         super().__init__(traced)
         with torch.no_grad():
             changing = changing or find_lighting(traced)

@@ -95,6 +95,7 @@ class ColoredRows:
     """
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
+        """Make an empty matrix."""
         self._shape = (rows, columns)
         self._small = small
         self.entries = 0
@@ -236,8 +237,10 @@ class TextureTransport:
         *,
         small: bool = False,
     ) -> None:
+        """Make empty matrices: from texels, and from cells of `CELL_SIZE` texels."""
         self._image_shape = image_shape
         self._texture_shape = texture_shape
+        # rounded up: the last cells of rows and columns may have fewer texels
         self._cell_shape = (
             -(-texture_shape[0] // CELL_SIZE),
             -(-texture_shape[1] // CELL_SIZE),
@@ -502,6 +505,7 @@ class LinearRenderer(Predictor):
         light: Inputs = MappingProxyType({}),
         collected: LinearizedScene | None = None,
     ) -> None:
+        """Trace the base image and the matrices, unless they were collected elsewhere."""
         super().__init__(traced)
         if collected is None:
             with torch.no_grad():

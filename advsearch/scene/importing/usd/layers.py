@@ -69,7 +69,11 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
 
 
 def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
-    """Check number, size, names and headers of the entries of a package."""
+    """Check number, size, names and headers of the entries of a package.
+
+    Names stay inside the package and have none of the characters that USD's paths use;
+    entries are stored as they are. Raises FileFormatError, or what zipfile raises.
+    """
     entries = archive.infolist()
     size = sum(entry.file_size for entry in entries)
     got = f"{len(entries):,} of {size:,}"
@@ -271,7 +275,11 @@ class _LayerCheck:
     def _check_packaged(
         self, package: str, entry: str, layer: str, entries: set[str]
     ) -> None:
-        """Raise FileFormatError if a layer in a package names one outside of it."""
+        """Raise FileFormatError if a layer in a package names one outside of it.
+
+        `entry` is the layer's path in the package `package`, `layer` the path that it
+        names, and `entries` are all paths in the package.
+        """
         outer, _ = Ar.SplitPackageRelativePathOuter(layer)
         from_entry = os.path.normpath(PurePosixPath(entry).parent / outer)
         # A path that does not begin with a dot may be relative to the package.

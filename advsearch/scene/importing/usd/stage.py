@@ -85,6 +85,7 @@ class Conversion:
     triangles: int = 0
 
     def __post_init__(self) -> None:
+        """Start an empty document, and find the skeletons of the stage."""
         self.header: dict[str, Any] = {
             name: [] for name in ("nodes", "meshes", "materials", "textures", "images")
         }
@@ -286,7 +287,11 @@ class Conversion:
     # ---- Cameras and lights ----
 
     def _add_camera(self, camera: Any, node: dict[str, Any]) -> None:
-        """Add a camera to a node; one that is not perspective counts as left out."""
+        """Add a camera to a node; one that is not perspective counts as left out.
+
+        An orthographic entry stands for it, which the reader of glTF notes. A shifted
+        aperture is noted here.
+        """
         width = _get_first(camera, "HorizontalAperture")
         height = _get_first(camera, "VerticalAperture")
         focal_length = _get_first(camera, "FocalLength")

@@ -430,7 +430,10 @@ class PreviewSurface:
     nodes: dict[str, Shader] = field(default_factory=dict)
 
     def convert(self) -> BoundMaterial:
-        """Write the material, and note the inputs that are not read."""
+        """Write the material, and note the inputs that are not read.
+
+        A specular workflow is read as if it were metallic, without metal.
+        """
         shader = self.shader
         is_specular = bool(shader.get_number("useSpecularWorkflow", 0.0))
         surface: dict[str, Any] = {}
@@ -460,7 +463,10 @@ class PreviewSurface:
         )
 
     def _note_unread(self, *, is_specular: bool) -> None:
-        """Note the inputs that are not read, of the surface and of its shaders."""
+        """Note the inputs that are not read, of the surface and of its shaders.
+
+        Those of the surface with a neutral value need no note.
+        """
 
         def is_quiet(name: str, shader_input: Any) -> bool:
             """Return whether an input changes nothing: its value is neutral."""
