@@ -162,6 +162,9 @@ def translate_entries(
 ) -> dict[str, Any] | None:
     """Translate the entries of one camera to those of OpenCV's files.
 
+    The tool is found by its entries: ORB-SLAM, KITTI, OpenSfM, stella_vslam, RealSense
+    or Metashape. The last three have one camera only, which has no name.
+
     Args:
         path: the file.
         camera_name: the name of the camera, "" if none is named.
@@ -188,26 +191,29 @@ def translate_entries(
         return _translate_opensfm(path, select_camera(path, camera_name, data))
     if camera_name:
         return None
-    stella = data.get("Camera")
-    if isinstance(stella, dict) and "model" in stella:
-        entries = {
-            STELLA_NAMES.get(str(name), str(name)): value
-            for name, value in stella.items()
-        }
-        kind = str(stella["model"])
-        entries["distortion_model"] = STELLA_KINDS.get(kind, kind)
-        return {
-            name: value
-            for name, value in entries.items()
-            if not ORBSLAM_NON_LENS_KEYS.fullmatch(f"Camera.{name}")
-        }
+    stella_camera = data.get("Camera")
+    if isinstance(stella_camera, dict) and "model" in stella_camera:
+        return _translate_stella(stella_camera)
     if "ppx" in data:
         return _translate_realsense(data)
-    if data.get("projection") in METASHAPE_KINDS or (
-        "projection" in data and "f" in data
-    ):
+    has_projection = data.get("projection") in METASHAPE_KINDS
+    if has_projection or ("projection" in data and "f" in data):
         return _translate_metashape(path, data)
     return None
+
+
+def _translate_stella(camera: Mapping[str, Any]) -> dict[str, Any]:
+    """Translate a camera of stella_vslam; entries not about the lens are left out."""
+    entries = {
+        STELLA_NAMES.get(str(name), str(name)): value for name, value in camera.items()
+    }
+    kind = str(camera["model"])
+    entries["distortion_model"] = STELLA_KINDS.get(kind, kind)
+    return {
+        name: value
+        for name, value in entries.items()
+        if not ORBSLAM_NON_LENS_KEYS.fullmatch(f"Camera.{name}")
+    }
 
 
 def _translate_orbslam(
@@ -244,8 +250,8 @@ def _translate_orbslam(
 def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
     """Return the names of the matrices of KITTI's cameras, by the cameras' names.
 
-    Its numbers are separated by blanks, and so are text; a list is the P1 of a stereo
-    pair of OpenCV.
+    Numbers separated by blanks are a text in YAML; a list P1 is no camera of KITTI's,
+    but of a stereo pair of OpenCV.
     """
     cameras = dict[str, str]()
     for name, value in data.items():

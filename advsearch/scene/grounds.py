@@ -275,14 +275,17 @@ def load_requested_place(scene: SceneDescription) -> Place | None:
     unless settings describe the ground. None where they ask for none.
     """
     kind = find_ground_kind(scene)
-    if kind in PLACE_BY_GROUND_KIND:
+    if kind is not None:
+        if kind not in PLACE_BY_GROUND_KIND:
+            return None
         return load_bundled_place(*PLACE_BY_GROUND_KIND[kind])
-    if kind is not None or scene.environment is None:
+    if scene.environment is None:
         return None
     has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
     if scene.number("ground.size") <= 0.0 or has_table_settings:
         return None
-    return scene.environment.place
+    place: Place | None = scene.environment.place
+    return place
 
 
 def with_requested_ground(scene: SceneDescription) -> SceneDescription:

@@ -501,6 +501,7 @@ def skin_points(
         rotations: (J, 3, 3) of the bones.
         translations: (J, 3).
     """
+    # (P, 12): the weighted mean of the bones' rotations and translations
     blended = torch.einsum(
         "pj,jk->pk", weights, torch.cat([rotations.reshape(-1, 9), translations], dim=1)
     )

@@ -382,7 +382,8 @@ class SkeletonRig:
                         rotation_about(axis, number_by_name[f"{joint}.{axis}"])
                         @ rotation
                     )
-            # From the axes of the object to those of the file, then of the parent.
+            # From the axes of the object to those of the file, then of the parent node
+            # at rest, in which local matrices are.
             rotation = rotation_to_mesh.T @ rotation @ rotation_to_mesh
             parent = int(self.skeleton.parents[node])
             if parent >= 0:

@@ -350,6 +350,7 @@ def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
     is_turned = (component_area[turned] > component_area[as_is]) | (
         (component_area[turned] == component_area[as_is]) & (turned < as_is)
     )
+    # A shell is one component, or two that are each other's reverse.
     _, shell = np.unique(np.minimum(as_is, turned), return_inverse=True)
     return is_turned, shell.astype(np.int64), bool((as_is == turned).any())
 
@@ -531,6 +532,7 @@ def normalize_vectors(vectors: Float64Array) -> Float64Array:
     Vectors without a direction become NaN.
     """
     with np.errstate(all="ignore"):
+        # First by the largest entry, so that squares neither overflow nor vanish.
         largest = np.abs(vectors).max(axis=-1, keepdims=True)
         scaled = vectors / largest
         unit_vectors = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)

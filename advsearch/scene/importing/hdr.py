@@ -108,6 +108,7 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
             "export it again"
         )
         raise FileFormatError(message) from error
+    # a number, or an enum with one
     environment_map = header.get("envmap")
     if getattr(environment_map, "value", environment_map) == CUBE_MAP:
         raise FileFormatError(
@@ -362,6 +363,7 @@ def _crop_to_display_window(
         notes.append("its data beyond the display window is left out")
 
     def crop(plane: Plane) -> Plane:
+        """Copy what both windows have into a black plane of the display window."""
         result = np.zeros((height, width), plane.dtype)
         if rows.stop > rows.start and columns.stop > columns.start:
             result[

@@ -97,7 +97,7 @@ def _compute_gain(radiance: Tensor) -> float:
     bin_sums = np.add.reduceat(row_sums, column_starts, axis=1)
     bin_means = bin_sums / np.outer(row_counts, column_counts)
     bin_means = bin_means[bin_means > MIN_LUMINANCE]
-    if not bin_means.size:
+    if not bin_means.size:  # the image is black
         return 1.0
     return float(KEY_LUMINANCE / np.exp2(np.log2(bin_means).mean()))
 

@@ -231,8 +231,11 @@ class FilmView:
         Paths have up to `depth` segments.
         """
         tracer = _path_tracer(max(depth, 1))
+        # without derivatives and state, which only the adjoint modes take
+        derivative = None
+        state = None
         return tracer.sample(
-            dr.ADMode.Primal, self.scene, sampler, ray, None, None, active
+            dr.ADMode.Primal, self.scene, sampler, ray, derivative, state, active
         )[0]
 
 

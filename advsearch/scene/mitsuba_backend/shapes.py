@@ -438,7 +438,7 @@ def _parse_numbers(value: object) -> Float64Array:
         is_constant = value.get("type") in ("rgb", "uniform", "spectrum", "srgb")
         value = value.get("value") if is_constant else None
     if isinstance(value, (str, bool)):
-        value = None
+        value = None  # which becomes NaN
     try:
         numbers = np.atleast_1d(np.asarray(value, np.float64))
     except (TypeError, ValueError):  # such as pairs of wavelength and value

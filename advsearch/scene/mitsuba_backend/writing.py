@@ -228,10 +228,12 @@ def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
         linear = torch.from_numpy(part_inputs.pop("base_color"))
         part = replace(part, base_color=linear_to_srgb(linear).numpy())
     if "radiance" in part_inputs:
+        # one color (3,), or a texture (h, w, 3)
         radiance = part_inputs.pop("radiance")
         size = radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)
         part = replace(part, emission=radiance.reshape(-1, *size))
     if part.surface is None:
+        # the surface's parameters, each (1,)
         numbers = {
             name: float(part_inputs.pop(name)[0])
             for name in MATERIAL_INPUTS

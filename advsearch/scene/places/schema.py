@@ -36,6 +36,7 @@ def _is_convex(corners: Float64Array) -> bool:
     Either side will do; a corner on a straight line does not count, within rounding.
     """
     edges = np.roll(corners, -1, axis=0) - corners
+    # cross products of successive edges
     turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
         edges[:, 0], -1
     )

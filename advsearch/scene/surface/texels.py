@@ -528,6 +528,7 @@ def _pool(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
 
     Radiance is (H, W, 3), the solid angles (H, W); the result is (*size, 3).
     """
+    # The solid angles are pooled as a fourth channel.
     weighted = torch.cat([radiance * sine[..., None], sine[..., None]], dim=-1)
     pooled = functional.adaptive_avg_pool2d(weighted.permute(2, 0, 1)[None], size)
     pooled = pooled[0].permute(1, 2, 0)

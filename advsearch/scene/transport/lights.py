@@ -252,7 +252,9 @@ def _make_harmonic_maps(like: Tensor) -> Tensor:
     columns at both ends.
     """
     basis = compute_real_harmonics(like.shape[0], like.shape[1] - 2)
+    # (9, H, W): the last column before the first, and the first after the last
     padded = torch.cat([basis[:, -1:], basis, basis[:, :1]], dim=1).permute(2, 0, 1)
+    # The first is 1 everywhere, so that subtracting the minimum adds a multiple of it.
     lifted = padded - padded.amin(dim=(1, 2), keepdim=True).clamp_max(0.0)
     scaled = lifted * float(like.mean().clamp_min(1e-12))
     return scaled[..., None].expand(-1, -1, -1, 3).contiguous()
