@@ -89,7 +89,7 @@ class Soup:
 def compute_rotation(up: str, front: str) -> Float64Array:
     """Return the rotation (3, 3) from a file's axes to ours (front +x, up +z).
 
-    `up` is "y" or "z", `front` one of `FACINGS` along another axis.
+    `up` is "y" or "z", `front` one of `FRONT_AXES` along another axis.
     """
     front_axis = np.eye(3)["xyz".index(front[1])]
     front_axis = front_axis * (-1.0 if front[0] == "-" else 1.0)

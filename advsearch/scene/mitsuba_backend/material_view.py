@@ -362,7 +362,7 @@ def compute_outline_term(
 
     Args:
         view: the scene.
-        mesh: one that moves.
+        mesh: one that moves, or one that stands still and may hide it.
         seed: of the samples.
         mesh_index: index of the mesh.
         spp: samples, in multiples of the number of pixels.
@@ -571,7 +571,7 @@ def compute_shadow_term(
 
     Args:
         view, seed, mesh_index, spp: as for `compute_outline_term`.
-        mesh: one that moves.
+        mesh: one that moves, or one that stands still and may shade it.
     """
     stream = make_stream(seed, _SHADOWS, mesh_index)
     random = sample_uniform(stream, spp * view.camera.pixels, 4)
@@ -589,6 +589,7 @@ def compute_shadow_term(
     edge_normal = to_drjit_vectors(mi.Vector3f, sampled.normal)
     offset = SHADOW_OFFSET * mesh.extent * edge_normal
     with dr.suspend_grad():
+        # The line goes on from just past the edge, with the light, to the lit point.
         ray = mi.Ray3f(edge_position + offset, -light_direction)
         hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, hit.is_valid())

@@ -478,7 +478,7 @@ class LinearRenderer(Predictor):
         u: (d,) configuration at which it is linearised.
         seed: of the noise.
         tick: is called with samples per pixel as they are traced; there are
-            `samples_to_collect` in all.
+            `count_samples` in all.
         spp: samples per pixel.
         quick: remove the noise from the rows of the matrix as from the base image,
             which they resemble, and not by the denoiser.
