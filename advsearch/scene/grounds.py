@@ -284,8 +284,8 @@ def load_requested_place(scene: SceneDescription) -> Place | None:
     has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
     if scene.number("ground.size") <= 0.0 or has_table_settings:
         return None
-    place: Place | None = scene.environment.place
-    return place
+    environment_place: Place | None = scene.environment.place
+    return environment_place
 
 
 def with_requested_ground(scene: SceneDescription) -> SceneDescription:

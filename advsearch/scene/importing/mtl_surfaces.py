@@ -25,7 +25,7 @@ from advsearch.scene.importing.parts import (
 from advsearch.scene.importing.pictures import FileImages, ImageKind
 from advsearch.scene.importing.texture import average_over_faces
 from advsearch.scene.importing.unread import TrackedKeys
-from advsearch.trust.named_files import References, plain_name
+from advsearch.trust.named_files import References, normalize_name
 
 IGNORED_KEYWORDS = frozenset("ka ks ns ni sharpness map_aat".split())
 """Common statements that a physical material cannot have: ambient light, Phong's
@@ -91,7 +91,7 @@ class MtlReader:
         try:
             text = decode_text(self.references.get(name))
         except FileNotFoundError:
-            file_name = plain_name(name)
+            file_name = normalize_name(name)
             missing_file = (
                 f"{format_name(file_name)}, which {self.references.refused[file_name]}"
             )
@@ -100,7 +100,7 @@ class MtlReader:
             )
             return
         self.n_libraries += 1
-        file = plain_name(name).rpartition("/")[2]
+        file = normalize_name(name).rpartition("/")[2]
         materials, stray_keywords = parse_mtl(text, file)
         for keyword in stray_keywords:
             self.notes.record(
@@ -176,7 +176,7 @@ class MtlReader:
             return []
         exists = (
             isinstance(
-                self.references.tried(replace_square(numbered_name, square)), bytes
+                self.references.find(replace_square(numbered_name, square)), bytes
             )
             for square in other_squares
         )
@@ -357,7 +357,7 @@ class MtlReader:
         use = parse_map(without_comment(statement))
         use_with_comment = parse_map(statement)
         if use_with_comment is not None and use_with_comment != use:
-            if isinstance(self.references.tried(use_with_comment.name), bytes):
+            if isinstance(self.references.find(use_with_comment.name), bytes):
                 use = use_with_comment  # the # belongs to the name
         self._uses[id(material), key] = use
         has_colors = key in ("map_kd", "map_ke")
@@ -591,7 +591,7 @@ def find_libraries(arguments: Sequence[str], references: References) -> list[str
 
 def _exists(references: References, name: str) -> bool:
     """Return whether there is a file of a name that may be read."""
-    return isinstance(references.tried(name), bytes)
+    return isinstance(references.find(name), bytes)
 
 
 def _has_mtl_suffix(name: str) -> bool:

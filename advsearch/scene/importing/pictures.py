@@ -17,16 +17,16 @@ from scipy import sparse
 from advsearch.errors import FileFormatError
 from advsearch.pictures import (
     FORMATS,
-    LARGEST_PIXELS,
+    MAX_PIXELS,
     check_decodable,
     check_pixels,
-    opened,
-    steps_of,
+    open_image,
+    to_8bit_levels,
 )
 from advsearch.scene.assets import Float32Array
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import Notes, format_name
-from advsearch.trust.named_files import References, plain_name
+from advsearch.trust.named_files import References, normalize_name
 from advsearch.trust.stored_files import LARGEST_FILE, check_most
 
 # Limit of the sides of an imported texture, in texels; larger ones are averaged down.
@@ -43,7 +43,7 @@ def read_image(
         FileFormatError: the file is missing, no ordinary file, no image, too large or
             corrupt.
     """
-    with opened(path, LARGEST_FILE) as image:
+    with open_image(path, LARGEST_FILE) as image:
         return load_display_image(image, limit, path, is_raw=is_raw)
 
 
@@ -85,7 +85,7 @@ def load_display_image(
             255.0
         )
         if shrink >= 1.0:
-            return np.asarray(display_of_level[steps_of(image, alpha=keep_alpha)])
+            return np.asarray(display_of_level[to_8bit_levels(image, alpha=keep_alpha)])
         target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
         linear_of_level = (
             display_of_level if is_raw else srgb_to_linear(display_of_level)
@@ -95,7 +95,7 @@ def load_display_image(
         def load_band(top: int, end: int) -> Float32Array:
             """Return rows of colors; with opacity also that, and their product."""
             band_image = image.crop((0, top, width, end))
-            levels = steps_of(band_image, alpha=is_weighted)
+            levels = to_8bit_levels(band_image, alpha=is_weighted)
             colors = linear_of_level[levels[:, :, :3]]
             if not is_weighted:
                 return colors
@@ -204,7 +204,7 @@ def _compute_overlaps(source: int, target: int) -> sparse.csr_array:
 
 
 ImageKind = Literal["colours", "colours and alpha", "numbers"]  # what a picture holds
-LARGEST_SUM = 2 * LARGEST_PIXELS
+LARGEST_SUM = 2 * MAX_PIXELS
 """Limit of the pixels of all color textures of a file, and of those of numbers; before
 `scaled`.
 """
@@ -300,7 +300,7 @@ class FileImages:
         try:
             image = Image.open(io.BytesIO(read_bytes()), formats=FORMATS)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-            return self.references.refused.get(plain_name(name), UNREADABLE)
+            return self.references.refused.get(normalize_name(name), UNREADABLE)
         (width, height) = image.size
         is_raw = kind == "numbers"
         n_pixels = self._pixels[is_raw] + width * height

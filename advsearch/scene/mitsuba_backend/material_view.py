@@ -697,7 +697,7 @@ class _TangentSamples(NamedTuple):
     measure_per_sample: float  # world units times steradians
 
 
-def _turn_away(vectors: Tensor, directions: Tensor) -> Tensor:
+def _orient_outwards(vectors: Tensor, directions: Tensor) -> Tensor:
     """Return vectors (N, 3), turned over where they point along a direction (N, 3)."""
     points_inwards = (vectors * directions).sum(dim=1, keepdim=True) > 0.0
     return vectors * torch.where(points_inwards, -1.0, 1.0)
@@ -741,7 +741,7 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
         + (1.0 - edge_cosine.square()).clamp_min(0.0).sqrt() * perpendicular
     )
 
-    normal = _turn_away(torch.linalg.cross(axis, perpendicular), first + second)
+    normal = _orient_outwards(torch.linalg.cross(axis, perpendicular), first + second)
     return _TangentSamples(
         ends=edges.ends[edge_index],
         fraction=random[:, 1],
