@@ -279,13 +279,10 @@ def load_requested_place(scene: SceneDescription) -> Place | None:
         if kind not in PLACE_BY_GROUND_KIND:
             return None
         return load_bundled_place(*PLACE_BY_GROUND_KIND[kind])
-    if scene.environment is None:
-        return None
     has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
-    if scene.number("ground.size") <= 0.0 or has_table_settings:
-        return None
-    environment_place: Place | None = scene.environment.place
-    return environment_place
+    is_described = scene.number("ground.size") <= 0.0 or has_table_settings
+    environment = scene.environment
+    return None if environment is None or is_described else environment.place
 
 
 def with_requested_ground(scene: SceneDescription) -> SceneDescription:
