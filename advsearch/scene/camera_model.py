@@ -157,7 +157,7 @@ class CameraModel:
         """
         u, v = image_points.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
-            return _panorama_directions(u, v), torch.ones_like(u)
+            return _compute_panorama_directions(u, v), torch.ones_like(u)
         distorted = self._to_distorted(u, v)
         radius = distorted.norm(dim=-1)
         radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
@@ -322,7 +322,7 @@ class CameraModel:
             return math.tan(self.fold_angle) * (1.0 - 1e-9)
         return math.inf
 
-    def _radial_scale(self, square: Tensor) -> Tensor:
+    def _compute_radial_scale(self, square: Tensor) -> Tensor:
         """Return radial(r) / r at r^2, of any shape."""
         numerator, denominator = self._polynomials
         value = _evaluate_polynomial(numerator, square)
@@ -332,11 +332,11 @@ class CameraModel:
 
     def _distort_radius(self, radius: Tensor) -> Tensor:
         """Return the radial distortion of radii, or of angles of a fisheye."""
-        return radius * self._radial_scale(radius * radius)
+        return radius * self._compute_radial_scale(radius * radius)
 
     def _distort(self, undistorted: Tensor) -> Tensor:
         """Return distorted points of undistorted ones (N, 2)."""
-        scale = self._radial_scale(undistorted.square().sum(dim=-1))
+        scale = self._compute_radial_scale(undistorted.square().sum(dim=-1))
         return undistorted * scale[..., None] + self._compute_decentering(undistorted)
 
     def _compute_decentering(self, undistorted: Tensor) -> Tensor:
@@ -533,7 +533,7 @@ def _project_to_panorama(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     return torch.stack([column, row], dim=-1)
 
 
-def _panorama_directions(u: Tensor, v: Tensor) -> Tensor:
+def _compute_panorama_directions(u: Tensor, v: Tensor) -> Tensor:
     """Return unit vectors (N, 3) at image coordinates of an equirectangular image."""
     longitude = (u - 0.5) * (2.0 * torch.pi)
     latitude = (v - 0.5) * torch.pi

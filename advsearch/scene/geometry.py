@@ -146,7 +146,9 @@ def compute_framing_distance(
     from_default_view = (
         outwards + torch.maximum(left.abs() / half_width, up.abs() / half_height)
     ).max()
-    from_all_around = _framing_distance_all_around(offsets, elevation, edge_tangents)
+    from_all_around = _compute_framing_distance_all_around(
+        offsets, elevation, edge_tangents
+    )
     return torch.maximum(from_default_view, from_all_around).clamp_min(
         float(offsets.norm(dim=1).max()) + MIN_SPHERE_DISTANCE
     )
@@ -186,7 +188,7 @@ def compute_center(description: SceneDescription) -> Float64Array:
     return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
 
 
-def _framing_distance_all_around(
+def _compute_framing_distance_all_around(
     offsets: Tensor, elevation: float, tangents: Tensor
 ) -> Tensor:
     """Return the distance at which every vertex is in the image from every azimuth.

@@ -88,7 +88,7 @@ MAP_HINT = "A path to an .hdr or .exr file, or to the .yaml file of a place, wor
 OBJECT_HINT = f"A path to a file that ends in {either(MESHES)} works too."
 
 
-def _data_directory() -> Traversable:
+def _get_data_directory() -> Traversable:
     """Return the directory of the bundled data."""
     return resources.files("advsearch.bundled") / "data"
 
@@ -98,7 +98,7 @@ def list_objects() -> tuple[str, ...]:
     return tuple(
         sorted(
             p.name
-            for p in (_data_directory() / "objects").iterdir()
+            for p in (_get_data_directory() / "objects").iterdir()
             if (p / "mesh.ply").is_file()
         )
     )
@@ -121,7 +121,9 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
 
 def _read_environment_facts() -> dict[str, dict[str, Any]]:
     """Return what the scripts have stored about each bundled environment, by its name."""
-    text = (_data_directory() / "environments" / "environments.json").read_text("utf-8")
+    text = (_get_data_directory() / "environments" / "environments.json").read_text(
+        "utf-8"
+    )
     facts: dict[str, dict[str, Any]] = json.loads(text)["environments"]
     return facts
 
@@ -138,7 +140,7 @@ def load_object(name: str) -> ObjectAsset:
     known_names = list_objects()
     if name not in known_names:
         raise UnknownNameError("object", name, known_names, OBJECT_HINT)
-    directory = _data_directory() / "objects" / name
+    directory = _get_data_directory() / "objects" / name
     try:
         facts = json.loads((directory / "object.json").read_text("utf-8"))
         mesh = _read_mesh(name, directory, facts.get("faces", ()))
@@ -229,7 +231,7 @@ def load_environment(name: str) -> EnvironmentAsset:
     facts = _read_environment_facts()[name]
     try:
         content = (
-            _data_directory() / "environments" / f"{facts.get('map', name)}.exr"
+            _get_data_directory() / "environments" / f"{facts.get('map', name)}.exr"
         ).read_bytes()
         radiance: Float32Array = np.stack(
             read_exr(Path(name), content)[0], axis=2

@@ -37,7 +37,7 @@ AGES = (10.0, 25.0, 90.0)  # years of MakeHuman's child, young and old
 _body_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
 
 
-def _joint_parameter(name: str, low: float, high: float, text: str) -> Parameter:
+def _make_joint_parameter(name: str, low: float, high: float, text: str) -> Parameter:
     """Return the parameter of a joint's angle, 0 by default."""
     return _body_parameter(name, "degrees", low, high, 0.0, text)
 
@@ -83,11 +83,11 @@ WALK = (
                                            "ordinary step.", (0.0, 1.0)),
 )  # fmt: skip
 SPINE = (
-    _joint_parameter("spine", -20.0, 60.0, "Bend of the back, ahead."),
-    _joint_parameter("spine_side", -25.0, 25.0, "Bend of the back to the left."),
-    _joint_parameter("spine_turn", -35.0, 35.0, "Turn of the chest to the left."),
-    _joint_parameter("neck", -45.0, 45.0, "Nod of the head, ahead."),
-    _joint_parameter("neck_turn", -70.0, 70.0, "Turn of the head to the left."),
+    _make_joint_parameter("spine", -20.0, 60.0, "Bend of the back, ahead."),
+    _make_joint_parameter("spine_side", -25.0, 25.0, "Bend of the back to the left."),
+    _make_joint_parameter("spine_turn", -35.0, 35.0, "Turn of the chest to the left."),
+    _make_joint_parameter("neck", -45.0, 45.0, "Nod of the head, ahead."),
+    _make_joint_parameter("neck_turn", -70.0, 70.0, "Turn of the head to the left."),
 )
 LIMBS = (
     ("shoulder", -50.0, 170.0, "arm, raised ahead"),
@@ -101,7 +101,7 @@ LIMBS = (
 )
 """Joints on both sides, with their limits in degrees."""
 _JOINTS = tuple(
-    _joint_parameter(f"{side}_{name}", low, high, f"{side.capitalize()} {text}.")
+    _make_joint_parameter(f"{side}_{name}", low, high, f"{side.capitalize()} {text}.")
     for side in ("left", "right")
     for name, low, high, text in LIMBS
 )
@@ -403,7 +403,7 @@ class Person:
                     end_point - start_point, joints.new_tensor([x, sign * y, z])
                 )
             rotations[f"hand_{side}"] = (
-                rotation_about("z", joints.new_tensor(sign * 60.0))
+                make_axis_rotation("z", joints.new_tensor(sign * 60.0))
                 @ rotations[f"lowerarm_{side}"]
             )
         return rotations
@@ -543,13 +543,13 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
         angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn")
     )
     spine_rotation = (
-        rotation_about("y", spine)
-        @ rotation_about("x", -side)
-        @ rotation_about("z", turn)
+        make_axis_rotation("y", spine)
+        @ make_axis_rotation("x", -side)
+        @ make_axis_rotation("z", turn)
     )
-    neck_rotation = rotation_about("z", angle["neck_turn"] / 2.0) @ rotation_about(
-        "y", angle["neck"] / 2.0
-    )
+    neck_rotation = make_axis_rotation(
+        "z", angle["neck_turn"] / 2.0
+    ) @ make_axis_rotation("y", angle["neck"] / 2.0)
     rotations = {
         "spine_01": spine_rotation,
         "spine_02": spine_rotation,
@@ -575,21 +575,21 @@ def _compute_limb_turns(
     limb_angles = {joint: angle_by_joint[f"{side}_{joint}"] for joint, *_ in LIMBS}
     suffix = side[0]
     rotations = dict[str, Tensor]()
-    shoulder_rotation = rotation_about(
+    shoulder_rotation = make_axis_rotation(
         "x", sign * limb_angles["shoulder_out"]
-    ) @ rotation_about("y", -limb_angles["shoulder"])
-    shoulder_turn = rotation_about("z", -sign * limb_angles["shoulder_turn"])
+    ) @ make_axis_rotation("y", -limb_angles["shoulder"])
+    shoulder_turn = make_axis_rotation("z", -sign * limb_angles["shoulder_turn"])
     rotations[f"upperarm_{suffix}"] = shoulder_rotation @ shoulder_turn
-    rotations[f"lowerarm_{suffix}"] = rotation_about("y", -limb_angles["elbow"])
-    rotations[f"thigh_{suffix}"] = rotation_about(
+    rotations[f"lowerarm_{suffix}"] = make_axis_rotation("y", -limb_angles["elbow"])
+    rotations[f"thigh_{suffix}"] = make_axis_rotation(
         "x", sign * limb_angles["hip_out"]
-    ) @ rotation_about("y", -limb_angles["hip"])
-    rotations[f"calf_{suffix}"] = rotation_about("y", limb_angles["knee"])
-    rotations[f"foot_{suffix}"] = rotation_about("y", -limb_angles["ankle"])
+    ) @ make_axis_rotation("y", -limb_angles["hip"])
+    rotations[f"calf_{suffix}"] = make_axis_rotation("y", limb_angles["knee"])
+    rotations[f"foot_{suffix}"] = make_axis_rotation("y", -limb_angles["ankle"])
     return rotations
 
 
-def rotation_about(axis: str, degrees: Tensor) -> Tensor:
+def make_axis_rotation(axis: str, degrees: Tensor) -> Tensor:
     """Return the right-handed rotation (3, 3) about an axis of the body."""
     cosine = torch.cos(torch.deg2rad(degrees))
     sine = torch.sin(torch.deg2rad(degrees))

@@ -71,11 +71,11 @@ def find_candidate_pixels(
     Returns:
         Triangle, row and column (N,).
     """
-    face, row = _integers_within(
+    face, row = _list_integers_within(
         corners[..., 1].min(axis=1), corners[..., 1].max(axis=1), shape[0], tolerance
     )
     left, right = _cross_rows(corners[face], row, tolerance)
-    span, column = _integers_within(left, right, shape[1], tolerance)
+    span, column = _list_integers_within(left, right, shape[1], tolerance)
     return face[span], row[span], column
 
 
@@ -92,9 +92,9 @@ def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray
     shifted = corners + 1.0
     lowest_row = np.floor(shifted[..., 1].min(axis=1) - PIXEL_TOLERANCE)
     highest_row = np.floor(shifted[..., 1].max(axis=1) + PIXEL_TOLERANCE)
-    face, row = _integers_within(lowest_row, highest_row, shape[0] + 1, 0.0)
-    left, right = _span_of_rows(shifted[face], row)
-    span, column = _integers_within(
+    face, row = _list_integers_within(lowest_row, highest_row, shape[0] + 1, 0.0)
+    left, right = _find_column_span(shifted[face], row)
+    span, column = _list_integers_within(
         np.floor(left - PIXEL_TOLERANCE),
         np.floor(right + PIXEL_TOLERANCE),
         shape[1] + 1,
@@ -110,7 +110,7 @@ def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray
     return is_read
 
 
-def _span_of_rows(
+def _find_column_span(
     corners: Float64Array, row: IntArray
 ) -> tuple[Float64Array, Float64Array]:
     """Return the columns that triangles (N, 3, 2) have between a row (N,) and the next.
@@ -158,7 +158,7 @@ def compute_doubled_areas(corners: Float64Array) -> Float64Array:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def _integers_within(
+def _list_integers_within(
     lower: Float64Array, upper: Float64Array, size: int, tolerance: float
 ) -> tuple[IntArray, IntArray]:
     """List the integers of many intervals within [0, size - 1].
@@ -316,7 +316,7 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
             "again"
         )
     points = np.stack([column, row], axis=1)
-    weights = _clipped_weights(corners[face], points)
+    weights = _compute_clipped_weights(corners[face], points)
     face_map = np.zeros(shape, np.int64)
     weight_map = np.zeros((*shape, 3))
     covered = np.zeros(shape, np.bool_)
@@ -328,7 +328,7 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     return Charts(mesh, face_map[nearest], weight_map[nearest], covered, distance)
 
 
-def _clipped_weights(corners: Float64Array, points: IntArray) -> Float64Array:
+def _compute_clipped_weights(corners: Float64Array, points: IntArray) -> Float64Array:
     """Return the barycentric weights (N, 3) of points, clipped to their triangles."""
     doubled = compute_doubled_areas(corners)
     # A triangle without area has even weights, see below.

@@ -24,7 +24,7 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.options import Value
 from advsearch.scene.assets import Float64Array, IntArray
-from advsearch.scene.people import PARAMETERS, rotation_about
+from advsearch.scene.people import PARAMETERS, make_axis_rotation
 from advsearch.scene.settings import Parameter
 from advsearch.scene.skeleton import (
     Clip,
@@ -275,7 +275,7 @@ class SkeletonRig:
             self._compute_world(local_matrices)[self._nodes.to(device)]
             @ self._inverse_binds.to(device)
         )[:, :3]
-        points = self._morphed_points(number_by_name, clip_weights, device)
+        points = self._compute_morphed_vertices(number_by_name, clip_weights, device)
         weights = self._weights.to(device)
         joints = self._joints.to(device)
         # (V, 3, 4): the weighted mean of the matrices of a vertex's joints
@@ -288,7 +288,7 @@ class SkeletonRig:
             torch.einsum("vij,vj->vi", matrices[:, :, :3], points) + matrices[:, :, 3]
         )
 
-    def _morphed_points(
+    def _compute_morphed_vertices(
         self,
         number_by_name: Mapping[str, Tensor],
         clip_weights: Mapping[int, Tensor],
@@ -379,7 +379,7 @@ class SkeletonRig:
             for axis in AXES:
                 if f"{joint}.{axis}" in number_by_name:
                     rotation = (
-                        rotation_about(axis, number_by_name[f"{joint}.{axis}"])
+                        make_axis_rotation(axis, number_by_name[f"{joint}.{axis}"])
                         @ rotation
                     )
             # From the axes of the object to those of the file, then of the parent node

@@ -190,7 +190,9 @@ class Parameter:
         )
 
 
-def _surface(name: str, text: str, search: tuple[float, float]) -> Parameter:
+def _make_surface_parameter(
+    name: str, text: str, search: tuple[float, float]
+) -> Parameter:
     """Return a parameter of the principled surface."""
     return Parameter(
         name=name,
@@ -396,7 +398,7 @@ RAINDROPS = (
 LAMPS = ("off", "low", "high")
 
 
-def _lamps(whose: str) -> Parameter:
+def _make_lamp_parameter(whose: str) -> Parameter:
     """Return the parameter for the lamps of a car."""
     text = (
         f"Headlamps of {whose}, with its tail lamps: the low beam, or the high "
@@ -520,31 +522,33 @@ GROUND = (
     ),
 )
 MATERIAL = (
-    _surface(
+    _make_surface_parameter(
         "roughness", "Roughness of the surface: 0 is polished, 1 is matt.", (0.1, 1.0)
     ),
-    _surface(
+    _make_surface_parameter(
         "metallic",
         "How metallic it is: 0 is paint, wood or glaze, 1 is bare metal.",
         (0.0, 1.0),
     ),
-    _surface(
+    _make_surface_parameter(
         "specular", "Strength of the reflection off what is not metal.", (0.0, 1.0)
     ),
-    _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
+    _make_surface_parameter(
+        "clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)
+    ),
 )
 FAMILIES = {
     "camera": (
         *CAMERA,
         EXPOSURE_VALUE,
         *RAINDROPS,
-        _lamps("the car that the camera is in"),
+        _make_lamp_parameter("the car that the camera is in"),
     ),
     "pose": POSE,
     "environment": ENVIRONMENT,
     "ground": GROUND,
     "material": MATERIAL,
-    "object": (_lamps("the object, a car"),),
+    "object": (_make_lamp_parameter("the object, a car"),),
 }
 
 SETTINGS: Mapping[str, Parameter] = {

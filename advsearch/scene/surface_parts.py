@@ -138,7 +138,7 @@ def _find_patches(soup: Soup) -> IntArray:
     Returns:
         The patch of each face (F,), numbered from 0.
     """
-    normals: Float64Array = normalize_vectors(soup.face_vectors())
+    normals: Float64Array = normalize_vectors(soup.compute_face_vectors())
     count = len(normals)
     left, right, _ = find_shared_edges(soup.faces)
     # faces of both corners (3 face + k) of an edge

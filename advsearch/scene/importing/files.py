@@ -107,7 +107,7 @@ def find_advice(path: Path) -> str | None:
     suffix = path.suffix.lower()
     for kind, (operator, blender_suffixes) in BLENDER_IMPORTERS.items():
         if suffix in blender_suffixes:
-            return f"{kind}: {_blender_advice(path, operator)}"
+            return f"{kind}: {_make_blender_advice(path, operator)}"
     if suffix == ".bin":
         gltf_file = ""
         if path.parent.is_dir():
@@ -124,7 +124,7 @@ def find_advice(path: Path) -> str | None:
     return None
 
 
-def _blender_advice(path: Path, operator: str) -> str:
+def _make_blender_advice(path: Path, operator: str) -> str:
     """Return the command by which Blender converts a file to glTF."""
     target = json.dumps(f"{path.stem}.glb")
     script = (
@@ -180,7 +180,7 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
         _check_suffix(path, what, suffixes)
         data = stored_files.read_bytes(path, f"an {what} file", LARGEST_FILE)
     except FileNotFoundError as error:
-        hint = _missing_file_hint(path, suffixes)
+        hint = _make_missing_file_hint(path, suffixes)
         raise FileFormatError(
             f"{path}: no such {what} file.{hint} Check the path"
         ) from error
@@ -223,7 +223,7 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
     )
 
 
-def _missing_file_hint(path: Path, suffixes: Sequence[str]) -> str:
+def _make_missing_file_hint(path: Path, suffixes: Sequence[str]) -> str:
     """Return a sentence that helps to find a missing file, with a blank before it."""
     hint = ""
     if not path.parent.is_dir():

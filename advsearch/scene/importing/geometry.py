@@ -81,7 +81,7 @@ class Soup:
             self, **{name: getattr(self, name)[rows, order] for name in names}
         )
 
-    def face_vectors(self) -> Float64Array:
+    def compute_face_vectors(self) -> Float64Array:
         """Return face normals (F, 3), as long as twice the faces' areas."""
         return compute_area_vectors(self.points[self.faces])
 
@@ -213,7 +213,9 @@ def repair(soup: Soup, source: str, notes: Notes) -> Soup:
     Raises:
         InputError: no face has an area; the message names the file, `source`.
     """
-    has_no_area = np.linalg.norm(soup.face_vectors(), axis=1) <= MIN_DOUBLED_AREA
+    has_no_area = (
+        np.linalg.norm(soup.compute_face_vectors(), axis=1) <= MIN_DOUBLED_AREA
+    )
     if has_no_area.all():
         raise InputError(
             f"{source}: expected faces with an area, got {len(has_no_area)} "
@@ -338,7 +340,7 @@ def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
         shell is one-sided.
     """
     left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
-    area = np.linalg.norm(soup.face_vectors(), axis=1)
+    area = np.linalg.norm(soup.compute_face_vectors(), axis=1)
     starts, ends = _link_windings(left_corner // 3, right_corner // 3, same_direction)
     component = find_components(2 * len(area), starts, ends)
     as_is = component[0::2]
@@ -391,7 +393,7 @@ def _find_inside_out_shells(soup: Soup, shell: IntArray) -> BoolArray:
         shell: the shell of each face, (F,).
     """
     face_counts = np.bincount(shell)
-    vectors = soup.face_vectors()
+    vectors = soup.compute_face_vectors()
     n_shells = len(face_counts)
     is_closed = _find_closed_shells(soup, shell, face_counts)
     volume = _compute_signed_volumes(soup, shell, vectors, face_counts)
@@ -448,7 +450,7 @@ def _fix_normals(soup: Soup, notes: Notes) -> Soup:
     What is missing, or on the back of its face, is computed: smooth, or that of the
     face where a part is flat.
     """
-    vectors = soup.face_vectors()
+    vectors = soup.compute_face_vectors()
     area = np.linalg.norm(vectors, axis=1)
     is_known = np.isfinite(soup.normals).all(axis=2)
     is_front = (soup.normals * vectors[:, None]).sum(axis=2) > 0.0
@@ -479,7 +481,7 @@ def compute_smooth_normals(soup: Soup) -> Float64Array:
     than the crease angle share one normal: the mean of their normals weighted by their
     angles at that point (Thuermer and Wuethrich 1998).
     """
-    face_normals = normalize_vectors(soup.face_vectors())
+    face_normals = normalize_vectors(soup.compute_face_vectors())
     left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
     cosine = (face_normals[left_corner // 3] * face_normals[right_corner // 3]).sum(
         axis=1

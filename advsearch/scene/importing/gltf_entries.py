@@ -113,7 +113,7 @@ class Entry(BaseModel):
                     queue.extend(item.values() if isinstance(item, dict) else item)
 
 
-def _extension_field(*path: str, default: Any = None) -> Any:
+def _make_extension_field(*path: str, default: Any = None) -> Any:
     """Return a field whose value is in an extension of the entry."""
     return Field(default=default, validation_alias=AliasPath("extensions", *path))
 
@@ -191,7 +191,7 @@ class Node(Entry):
     camera: Index | None = None
     skin: Index | None = None
     # Index of the light of the node.
-    lamp: Index | None = _extension_field("KHR_lights_punctual", "light")
+    lamp: Index | None = _make_extension_field("KHR_lights_punctual", "light")
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
     translation: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     rotation: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
@@ -295,7 +295,7 @@ class TextureUse(Entry):
     texCoord: UvSetIndex = 0
     transform: Annotated[
         TextureTransform, BeforeValidator(lambda value: value or {})
-    ] = _extension_field("KHR_texture_transform", default=TextureTransform())
+    ] = _make_extension_field("KHR_texture_transform", default=TextureTransform())
     """Transform of the texture coordinates."""
 
     @property
@@ -356,10 +356,10 @@ class MaterialEntry(Entry):
     alphaCutoff: float = DEFAULT_ALPHA_CUTOFF
     doubleSided: Unread = None
     occlusionTexture: Unread = None
-    strength: Annotated[float, Field(ge=0.0)] = _extension_field(
+    strength: Annotated[float, Field(ge=0.0)] = _make_extension_field(
         "KHR_materials_emissive_strength", "emissiveStrength", default=1.0
     )
-    glossiness: SpecularGlossiness | None = _extension_field(
+    glossiness: SpecularGlossiness | None = _make_extension_field(
         "KHR_materials_pbrSpecularGlossiness"
     )
 
@@ -432,7 +432,7 @@ class Sampler(Entry):
 class Texture(Entry):
     source: Index | None = None
     sampler: Index | None = None
-    webp: Index | None = _extension_field("EXT_texture_webp", "source")
+    webp: Index | None = _make_extension_field("EXT_texture_webp", "source")
 
     @property
     def image(self) -> int | None:
@@ -464,14 +464,14 @@ class Header(Entry):
     cameras: List[CameraEntry] = []
     skins: List[Skin] = []
     animations: List[Animation] = []
-    vrm: dict[str, HumanBone] = _extension_field(
+    vrm: dict[str, HumanBone] = _make_extension_field(
         "VRMC_vrm", "humanoid", "humanBones", default={}
     )
     """The bones of a person by the names of VRM 1."""
-    vrm_0: List[HumanBone] = _extension_field(
+    vrm_0: List[HumanBone] = _make_extension_field(
         "VRM", "humanoid", "humanBones", default=[]
     )
-    lights: List[LightEntry] = _extension_field(
+    lights: List[LightEntry] = _make_extension_field(
         "KHR_lights_punctual", "lights", default=[]
     )
     """The lights that nodes may carry."""

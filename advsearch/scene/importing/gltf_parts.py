@@ -996,7 +996,7 @@ def read_primitive(
     attributes = primitive.attributes
     if primitive.mode < TRIANGLES or "POSITION" not in attributes:
         return None
-    used_vertices, faces = _used_vertices(file, primitive)
+    used_vertices, faces = _find_used_vertices(file, primitive)
     positions = file.read_numbers(attributes["POSITION"], used_vertices)
     material = MaterialEntry()
     if primitive.material is not None:
@@ -1041,7 +1041,9 @@ def read_primitive(
     )
 
 
-def _used_vertices(file: GltfFile, primitive: Primitive) -> tuple[IntArray, IntArray]:
+def _find_used_vertices(
+    file: GltfFile, primitive: Primitive
+) -> tuple[IntArray, IntArray]:
     """Return the vertices (V,) that the faces of a primitive have, and the faces.
 
     Primitives may share accessors, so not every vertex is used. Faces (F, 3) are

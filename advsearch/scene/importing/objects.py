@@ -310,7 +310,7 @@ def _compute_mean_material(
     """
     visible_area = np.bincount(
         soup.part,
-        weights=np.linalg.norm(soup.face_vectors(), axis=1),
+        weights=np.linalg.norm(soup.compute_face_vectors(), axis=1),
         minlength=len(surfaces),
     )
     materials = [Material().with_values(vars(surface), "") for surface in surfaces]

@@ -349,7 +349,7 @@ def split_at_corners(
         corner_key, return_index=True, return_inverse=True
     )
 
-    def values_of_vertices(indexed: IndexedValues | None) -> Float64Array | None:
+    def gather_vertex_values(indexed: IndexedValues | None) -> Float64Array | None:
         """Return values (V, C), NaN where there are none; None if there are none."""
         if indexed is None:
             return None
@@ -362,8 +362,8 @@ def split_at_corners(
     return ImportedPart(
         vertices=vertices,
         faces=faces.reshape(-1, 3),
-        normals=values_of_vertices(normals),
-        uvs=values_of_vertices(uvs),
+        normals=gather_vertex_values(normals),
+        uvs=gather_vertex_values(uvs),
         colors=None if colors is None else colors[triangles],
         surface=surface,
         flat=flat,

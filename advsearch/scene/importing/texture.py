@@ -292,7 +292,7 @@ def _is_usable(soup: Soup, uvs: Float64Array) -> bool:
     ):
         return False
     uv_area = np.abs(compute_doubled_areas(uvs)) / 2.0
-    surface_area = np.linalg.norm(soup.face_vectors(), axis=1)
+    surface_area = np.linalg.norm(soup.compute_face_vectors(), axis=1)
     # 1e-12: faces that are a point or a line in UV space
     squashed_area = surface_area[uv_area < 1e-12].sum()
     return bool(
@@ -479,7 +479,7 @@ def _sample_base_color(
     if surface.texture is not None:
         shows_texture = [other.texture is surface.texture for other in surfaces]
         is_selected = np.array(shows_texture)[soup.part]
-        areas = np.linalg.norm(soup.face_vectors(), axis=1)[is_selected]
+        areas = np.linalg.norm(soup.compute_face_vectors(), axis=1)[is_selected]
         mean = average_over_faces(
             _to_linear(surface.texture), soup.uvs[is_selected], areas
         )
@@ -638,7 +638,7 @@ def _unmirror(
     soup = replace(soup, uvs=uvs)
     normals = maps.normals
     is_mirrored = compute_doubled_areas(uvs) < 0.0
-    area = np.linalg.norm(soup.face_vectors(), axis=1)
+    area = np.linalg.norm(soup.compute_face_vectors(), axis=1)
     mirrored_fraction = float(area[is_mirrored].sum() / area.sum())
     if normals is None or mirrored_fraction < MIN_MIRRORED_FRACTION:
         return soup, maps

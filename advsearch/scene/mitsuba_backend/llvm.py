@@ -93,7 +93,7 @@ def find_libraries(
     Returns:
         Usable files first, each group newest first.
     """
-    patterns = [*_PATTERNS, *_conda_patterns(environ.get("CONDA_PREFIX", ""))]
+    patterns = [*_PATTERNS, *_list_conda_patterns(environ.get("CONDA_PREFIX", ""))]
     paths: list[Path] = []
     for pattern in patterns:
         matches = root.glob(pattern)
@@ -112,7 +112,7 @@ def find_libraries(
     )
 
 
-def _conda_patterns(prefix: str) -> list[str]:
+def _list_conda_patterns(prefix: str) -> list[str]:
     """Return patterns for an active conda environment, relative to the root."""
     if not prefix:
         return []

@@ -140,7 +140,7 @@ def material_adjoint(
         # the noise of the radiance cancels if it is the same there; for a smooth one it
         # averages out better if it is not.
         tile = ROUGH_TILE if _is_rough(cotangent) else 1
-        total += _interior_term(view, seed, spp, tile)
+        total += _compute_interior_term(view, seed, spp, tile)
     for index, mesh in enumerate([*view.moving_meshes, *view.still_meshes]):
         total += compute_outline_term(view, mesh, seed, index, boundary_spp)
         total += compute_shadow_term(view, mesh, seed, index, shadow_spp)
@@ -167,7 +167,7 @@ def _is_rough(cotangent: Tensor) -> bool:
     )
 
 
-def _interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
+def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
     """Return a value whose gradient by the vertices is the interior term.
 
     The chain is taken in two steps: first back to the points and normals of each
@@ -235,7 +235,7 @@ def _sample_first_hits(
     )
 
     # A cell has as many strata as samples, in an almost square grid.
-    strata_across = _largest_divisor(spp)
+    strata_across = _find_largest_divisor(spp)
     strata_shape = mi.Point2f(strata_across, spp // strata_across)
     stratum = mi.Point2f(sample % strata_across, sample // strata_across)
     film = mi.Point2f(column, row) - 0.5 + (stratum + sampler.next_2d()) / strata_shape
@@ -253,7 +253,7 @@ def _sample_first_hits(
     return film, hit, sampler
 
 
-def _largest_divisor(count: int) -> int:
+def _find_largest_divisor(count: int) -> int:
     """Return the largest divisor of a count that is at most its square root."""
     return max(n for n in range(1, int(count**0.5) + 1) if count % n == 0)
 

@@ -230,7 +230,7 @@ class FilmView:
 
         Paths have up to `depth` segments.
         """
-        tracer = _path_tracer(max(depth, 1))
+        tracer = _make_path_tracer(max(depth, 1))
         # without derivatives and state, which only the adjoint modes take
         derivative = None
         state = None
@@ -258,7 +258,7 @@ def _make_mesh(
 
 
 @cache
-def _path_tracer(depth: int) -> Any:
+def _make_path_tracer(depth: int) -> Any:
     # rr_depth: no path ends by chance before `max_depth`
     return mi.load_dict({"type": "prb", "max_depth": depth, "rr_depth": 1000})
 

@@ -196,7 +196,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             # ---- the next event: a surface, the outside, or the haze before it
             is_first = bounces + scatterings == 0
             si = self._intersect(scene, ray, is_first, active)
-            haze_start, haze_length = self._haze_segment(ray.o, ray.d, si.t)
+            haze_start, haze_length = self._find_haze_segment(ray.o, ray.d, si.t)
             with dr.resume_grad(when=not primal):
                 scattered, flight, weight, albedo, extinction = self._sample_flight(
                     sampler, haze_length, active
@@ -297,7 +297,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             )
         return si
 
-    def _haze_segment(
+    def _find_haze_segment(
         self, origin: Any, direction: Any, max_distance: Any
     ) -> tuple[Any, Any]:
         """Return where the haze starts on a segment, and its length (0 for a miss).
@@ -360,7 +360,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         active = active & (ds.pdf != 0.0)
         is_outside = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         distance = dr.select(is_outside, dr.inf, ds.dist)
-        _, haze_length = self._haze_segment(event.p, ds.d, distance)
+        _, haze_length = self._find_haze_segment(event.p, ds.d, distance)
         if not primal:
             with dr.resume_grad():
                 attached = scene.eval_emitter_direction(event, ds, active)
@@ -433,7 +433,7 @@ MAX_CELLS = 512
 NO_DROP = (0.0, 0.0, -1.0, 1.0)  # center, radius and curvature: a drop without inside
 
 
-def _transmittance(
+def _compute_transmittance(
     cos_incident: Any, cos_refracted: Any, ior_incident: float, ior_refracted: float
 ) -> Any:
     """Return Fresnel's transmittance of unpolarised light between two media.
@@ -492,9 +492,9 @@ def _refract_through_drop(
     outside_direction = (
         WATER_IOR * inside_direction + (cos_outside - WATER_IOR * cos_inside) * normal
     )
-    transmitted = _transmittance(
+    transmitted = _compute_transmittance(
         direction.z, inside_direction.z, 1.0, WATER_IOR
-    ) * _transmittance(cos_inside, cos_outside, WATER_IOR, 1.0)
+    ) * _compute_transmittance(cos_inside, cos_outside, WATER_IOR, 1.0)
     is_lost = (cos_outside_squared <= 0.0) | (outside_direction.z <= 0.0)
     return outside_direction, transmitted, is_lost
 

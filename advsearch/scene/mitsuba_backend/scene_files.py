@@ -656,7 +656,7 @@ def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCa
     fov = float(np.asarray(sensor.get("fov", 0.0)))
     if not fov:
         axis = "diagonal"
-        fov = _fov_of_focal_length(str(sensor.get("focal_length", "50mm")))
+        fov = _compute_diagonal_fov(str(sensor.get("focal_length", "50mm")))
     larger_side = max(width, height)
     length_of_axis = {
         "x": width,
@@ -670,7 +670,7 @@ def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCa
     return PosedCamera(matrix, 2.0 * math.degrees(math.atan(half_tangent)))
 
 
-def _fov_of_focal_length(text: str) -> float:
+def _compute_diagonal_fov(text: str) -> float:
     """Return the diagonal field of view in degrees of a focal length such as "50mm"."""
     length = 0.0
     with contextlib.suppress(ValueError):

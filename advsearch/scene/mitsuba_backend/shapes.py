@@ -231,20 +231,22 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
         uvs, faces = _make_grid(turns, turns[::2])
         polar = np.pi * uvs[:, 1]
         vertices = np.stack(
-            [*(np.sin(polar) * _circle_points(uvs[:, 0])), np.cos(polar)], axis=1
+            [*(np.sin(polar) * _compute_circle_points(uvs[:, 0])), np.cos(polar)],
+            axis=1,
         )
         normals = vertices
         shape_pose[:3, :3] *= _get_radius(shape)
         shape_pose[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
     elif kind == "cylinder":  # open at both ends, as Mitsuba's
         uvs, faces = _make_grid(turns, np.array([0.0, 1.0]))
-        vertices = np.stack([*_circle_points(uvs[:, 0]), uvs[:, 1]], axis=1)
+        vertices = np.stack([*_compute_circle_points(uvs[:, 0]), uvs[:, 1]], axis=1)
         normals = vertices * (1.0, 1.0, 0.0)
         shape_pose = _compute_cylinder_pose(shape)
     elif kind == "disk":
         uvs, faces = _make_grid(turns[::8], turns)
         vertices = np.stack(
-            [*(uvs[:, 0] * _circle_points(uvs[:, 1])), np.zeros(len(uvs))], axis=1
+            [*(uvs[:, 0] * _compute_circle_points(uvs[:, 1])), np.zeros(len(uvs))],
+            axis=1,
         )
     else:
         uvs, faces = _make_grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
@@ -308,7 +310,7 @@ def _make_grid(u: Float64Array, v: Float64Array) -> tuple[Float64Array, IntArray
     return points, np.concatenate([lower, upper])
 
 
-def _circle_points(turns: Float64Array) -> Float64Array:
+def _compute_circle_points(turns: Float64Array) -> Float64Array:
     """Return x and y on the unit circle, for fractions of a turn."""
     return np.asarray([np.cos(2.0 * np.pi * turns), np.sin(2.0 * np.pi * turns)])
 

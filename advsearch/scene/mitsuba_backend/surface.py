@@ -27,7 +27,7 @@ from advsearch.scene.mitsuba_backend.variant import Recordings, dr, mi, mitsuba_
 # object.
 MIN_BLENDED_SPREAD = 0.15
 MAX_BLENDED_SPREAD = 0.4
-CAMERA_SIZE = 16  # numbers of a camera in the kernel, see `_camera_numbers`
+CAMERA_SIZE = 16  # numbers of a camera in the kernel, see `_make_camera_numbers`
 RAY_PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
 """Positions of the rays of a pixel in it.
 
@@ -187,7 +187,7 @@ class ViewTracer:
             height, width = self._scene.resolution
             count = len(cameras)
             camera_rows = np.stack(
-                [_camera_numbers(inputs, height, width) for inputs in cameras]
+                [_make_camera_numbers(inputs, height, width) for inputs in cameras]
             ).astype(np.float32)
 
             def trace(
@@ -296,7 +296,7 @@ class ViewTracer:
     def _make_rays(self, lane: Any, cameras: Any, lens: Any) -> tuple[Any, Any]:
         """Return the ray of each lane, and whether the lens has one there.
 
-        `cameras` and `lens` are as for `_trace`. See `_camera_numbers` for a camera's
+        `cameras` and `lens` are as for `_trace`. See `_make_camera_numbers` for a camera's
         numbers.
         """
         height, width = self._scene.resolution
@@ -533,7 +533,7 @@ class ViewTracer:
         return dr.select(on_any_grid, radiance, 0.0)
 
 
-def _camera_numbers(
+def _make_camera_numbers(
     inputs: Mapping[str, Tensor], height: int, width: int
 ) -> Float32Array:
     """Return the `CAMERA_SIZE` numbers of a camera as the kernel takes them.

@@ -128,8 +128,8 @@ def _find_nearest_cell(grid: TexelGrid, si: Any) -> Any:
     y, x = compute_grid_position(grid, si.p, si.uv)
     return mi.Int32(
         grid.first_cell
-        + _cell_index(y, grid.shape[0]) * grid.shape[1]
-        + _cell_index(x, grid.shape[1])
+        + _compute_cell_index(y, grid.shape[0]) * grid.shape[1]
+        + _compute_cell_index(x, grid.shape[1])
     )
 
 
@@ -341,7 +341,7 @@ def compute_grid_position(grid: TexelGrid, position: Any, uv: Any) -> tuple[Any,
     return row, column
 
 
-def _cell_index(fraction: Any, count: int) -> Any:
+def _compute_cell_index(fraction: Any, count: int) -> Any:
     """Return the cell, of `count` along an axis, at a fraction in [0, 1] of it."""
     return mi.Int32(dr.minimum(fraction * count, count - 1.0))
 

@@ -289,12 +289,14 @@ class Bounce:
         density.
         """
         bsdf_value = self.bsdf_weight * self.bsdf_sample.pdf
-        slope_em = self._slope(self.wo_em, self.bsdf_value_em, self.active_em)
-        slope_bsdf = self._slope(self.bsdf_sample.wo, bsdf_value, self.active_bsdf)
+        slope_em = self._compute_slope(self.wo_em, self.bsdf_value_em, self.active_em)
+        slope_bsdf = self._compute_slope(
+            self.bsdf_sample.wo, bsdf_value, self.active_bsdf
+        )
         pdf = dr.select(self.active_bsdf, self.bsdf_sample.pdf, 1.0)
         return slope_em, slope_bsdf / pdf
 
-    def _slope(self, wo: Any, value_before: Any, active: Any) -> Any:
+    def _compute_slope(self, wo: Any, value_before: Any, active: Any) -> Any:
         """Return the change of a BSDF value over the change of the base color.
 
         It is 0 where the change is no larger than rounding, since the BSDF there may

@@ -98,9 +98,9 @@ def read_scene(path: Path) -> Plugin:
     scene = _convert_plugin(path, state, 0, referred)
     # plugins with ids that stand within others, to which the rest of the file may refer
     for name in sorted(referred):
-        if _plain_name(name) not in scene and name in state.id_to_index:
+        if _make_plain_name(name) not in scene and name in state.id_to_index:
             index = state.id_to_index[name]
-            scene[_plain_name(name)] = _convert_plugin(path, state, index, set())
+            scene[_make_plain_name(name)] = _convert_plugin(path, state, index, set())
     return scene
 
 
@@ -306,11 +306,12 @@ def _convert_plugin(path: Path, state: Any, index: int, referred: set[str]) -> P
             node = state.nodes[value.index()]
             name = _get_node_name(node, argument, at_top=index == 0)
             put(
-                _plain_name(name), _convert_plugin(path, state, value.index(), referred)
+                _make_plain_name(name),
+                _convert_plugin(path, state, value.index(), referred),
             )
         elif kind == types.Reference:
             referred.add(str(value.id()))
-            reference = {"type": "ref", "id": _plain_name(str(value.id()))}
+            reference = {"type": "ref", "id": _make_plain_name(str(value.id()))}
             put(argument or "ref", reference)
         else:
             put(
@@ -373,7 +374,7 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
     return entry
 
 
-def _plain_name(name: str) -> str:
+def _make_plain_name(name: str) -> str:
     """Return a name as Mitsuba's loader takes it: without dots."""
     return name.replace(".", "_")
 

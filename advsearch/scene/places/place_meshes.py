@@ -141,7 +141,7 @@ def _read_extension(path: Path, model: type[M], content: object) -> M:
         ) from None
 
 
-def _extension_of(entry: Entry, name: str) -> object:
+def _get_extension(entry: Entry, name: str) -> object:
     """Return an extension of an entry of the header; None if it has none."""
     return entry.extensions.get(name) if isinstance(entry.extensions, dict) else None
 
@@ -180,7 +180,7 @@ def read_place_meshes(
     variant_index = None if variant is None else _find_variant(path, header, variant)
     with without_pillows_limit(), np.errstate(all="ignore"):
         primitives, surfaces = _read_primitives(file, variant_index, notes)
-    note_left_out(_without_supported_extensions(header), notes)
+    note_left_out(_drop_supported_extensions(header), notes)
     _note_left_out(header, primitives, notes)
     check_faces(path, sum(len(primitive.part.faces) for primitive in primitives))
     groups = _group_by_material(header, primitives)
@@ -197,7 +197,7 @@ def read_place_meshes(
     return parts, list(notes)
 
 
-def _without_supported_extensions(header: Header) -> Header:
+def _drop_supported_extensions(header: Header) -> Header:
     """Return the header without the extensions that only places support."""
     used = [name for name in header.extensionsUsed if name not in PLACE_EXTENSIONS]
     required = [
@@ -229,7 +229,7 @@ def _note_left_out(
 
 def _find_variant(path: Path, header: Header, variant: str) -> int:
     """Return the index of a variant; raises UnknownNameError if the file has none such."""
-    extension = _read_extension(path, _Variants, _extension_of(header, VARIANTS))
+    extension = _read_extension(path, _Variants, _get_extension(header, VARIANTS))
     names = [entry.name for entry in extension.variants]
     if variant not in names:
         raise UnknownNameError(f"variant of {path.name}:", variant, names)
@@ -240,7 +240,7 @@ def _select_material(
     path: Path, header: Header, primitive: Primitive, variant: int | None
 ) -> int | None:
     """Return the index of the material that a primitive has in a variant."""
-    extension = _extension_of(primitive, VARIANTS)
+    extension = _get_extension(primitive, VARIANTS)
     if variant is None or extension is None:
         return primitive.material
     for mapping in _read_extension(path, _Mappings, extension).mappings:
@@ -402,11 +402,11 @@ def _group_by_material(
         name = _name_material(header, variant_material if is_covered else material)
         parts_by_mesh.setdefault((name, variant_material), []).append(part)
 
-    def material_order(item: tuple[NameAndMaterial, list[ImportedPart]]) -> int:
+    def get_material_order(item: tuple[NameAndMaterial, list[ImportedPart]]) -> int:
         (_, material), _ = item
         return -1 if material is None else material
 
-    return dict(sorted(parts_by_mesh.items(), key=material_order))
+    return dict(sorted(parts_by_mesh.items(), key=get_material_order))
 
 
 def _name_material(header: Header, index: int | None) -> str:

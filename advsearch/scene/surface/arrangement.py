@@ -207,11 +207,11 @@ class Arrangement:
         }
         scene.set_inputs(self.inputs)
         description = scene.definition[0]
-        vertices = self._object_buffer("vertices")
-        normals = self._object_buffer("normals")
+        vertices = self._get_object_buffer("vertices")
+        normals = self._get_object_buffer("normals")
         object_center = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         charts = rasterize_charts(description.meshes[OBJECT].mesh, OBJECT_TEXELS)
-        surfaces = self._texels_on_object(charts, vertices, normals)
+        surfaces = self._make_object_texels(charts, vertices, normals)
         self.n_sides = len(surfaces)
         # The ground goes on from the center of the object; a photographed one shows
         # what was taken from `capture_height`.
@@ -219,7 +219,7 @@ class Arrangement:
         self._has_ground = description.number("ground.size") > 0.0
         if self._has_ground:
             ground_center = (float(object_center[0]), float(object_center[1]))
-            reach = self._ground_reach(photograph is not None)
+            reach = self._compute_ground_reach(photograph is not None)
             surfaces.append(
                 texels.make_ground_texels(GROUND_NAME, 0.0, reach, ground_center)
             )
@@ -298,7 +298,7 @@ class Arrangement:
         sees_sky = (ground_cells >= len(self.texels.texel_of_cell)).any(axis=1)
         return texels.make_smoothing_matrix(ground, np.asarray(sees_sky))
 
-    def _object_buffer(self, buffer: str) -> Float32Array:
+    def _get_object_buffer(self, buffer: str) -> Float32Array:
         """Return the object's vertices or normals (V, 3)."""
         name = f"{OBJECT}.{buffer}"
         values = (
@@ -309,7 +309,7 @@ class Arrangement:
         rows: Float32Array = values.reshape(-1, 3).numpy()
         return rows
 
-    def _texels_on_object(
+    def _make_object_texels(
         self, charts: Charts, vertices: Float32Array, normals: Float32Array
     ) -> list[texels.LitTexels]:
         """Return the texels of the object; of both sides if its back is visible."""
@@ -321,7 +321,7 @@ class Arrangement:
             for side in (1, -1)
         ]
 
-    def _ground_reach(self, is_photographed: bool) -> float:
+    def _compute_ground_reach(self, is_photographed: bool) -> float:
         """Return half the width of the ground; a photographed one has no end."""
         if is_photographed:
             return math.inf
@@ -382,7 +382,7 @@ class Arrangement:
         points = (
             torch.from_numpy(center).float() + world_directions * distance[..., None]
         )
-        reach = self._ground_reach(self._capture_height is not None)
+        reach = self._compute_ground_reach(self._capture_height is not None)
         is_in_reach = (points[..., :2].abs() <= reach).all(dim=-1)
         capture_position = torch.tensor([0.0, 0.0, self._capture_height or 0.0])
         from_camera = (points - capture_position) @ self.world_to_map.T
@@ -433,11 +433,11 @@ class Arrangement:
         """
         with torch.no_grad():
             sky = texels.prepare_sky(padded)
-            reflectance = self._reflectance(color, padded)
+            reflectance = self._compute_reflectance(color, padded)
             irradiance = texels.compute_irradiance(
                 self._view_matrices,
                 sky,
-                self._hot_cosines(sky),
+                self._find_hot_cosines(sky),
                 reflectance,
                 BOUNCES,
             )
@@ -446,8 +446,10 @@ class Arrangement:
             far_ground = torch.ones(1, 3)
             if self._has_ground:
                 ground = self.texels.select_grid(self.n_sides)
-                leaving[ground] = self._leaving_ground(irradiance, leaving, padded)
-                far_ground = self._far_ground(leaving[ground])
+                leaving[ground] = self._compute_ground_radiance(
+                    irradiance, leaving, padded
+                )
+                far_ground = self._compute_far_ground(leaving[ground])
                 surroundings = self._put_ground(surroundings, far_ground, padded)
             side_irradiances = [
                 to_fine @ irradiance[self.texels.select_grid(side)]
@@ -458,7 +460,7 @@ class Arrangement:
             light_maps = make_light_maps(cells, padded, texels.blur_map(surroundings))
             return ArrangementLight(torch.cat(side_irradiances), light_maps)
 
-    def _hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
+    def _find_hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
         """Return the visible cosines (n, k) towards what is hot; None if nothing is."""
         hot_directions = sky.hot[0]
         if not len(hot_directions):
@@ -472,7 +474,7 @@ class Arrangement:
         )
         return torch.from_numpy(cosines)
 
-    def _leaving_ground(
+    def _compute_ground_radiance(
         self, irradiance: Tensor, leaving: Tensor, padded: Tensor
     ) -> Tensor:
         """Return what leaves the ground's texels (n, 3), smoothed.
@@ -486,7 +488,7 @@ class Arrangement:
         open_irradiance = unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
         return self._smooth @ (irradiance[ground] / open_irradiance)
 
-    def _far_ground(self, leaving: Tensor) -> Tensor:
+    def _compute_far_ground(self, leaving: Tensor) -> Tensor:
         """Return what leaves the ground far off (1, 3): the object hides little there.
 
         It is the mean of the texels (n, 3) at the border.
@@ -511,7 +513,7 @@ class Arrangement:
             ground = far_ground * photograph.reshape(*texels.BLURRED_SHAPE, 3)
         return torch.where(is_hidden[..., None], ground, surroundings)
 
-    def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
+    def _compute_reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
         """Return the reflectance (n, 3) of all texels for even light.
 
         That is the base color times the diffuse fraction, plus the gloss.
@@ -523,14 +525,14 @@ class Arrangement:
         object_cells = torch.from_numpy(self.texels.cells[self.texels.select_grid(0)])
         colors = [pooled[object_cells]] * self.n_sides
         if self._has_ground:
-            colors.append(self._ground_color(padded))
+            colors.append(self._compute_ground_color(padded))
         reflectances = []
         for surface_color, surface in zip(colors, self.lobes, strict=True):
             diffuse, gloss = torch.tensor(surface.mean_reflectances)
             reflectances.append(surface_color * diffuse + gloss)
         return torch.cat(reflectances)
 
-    def _ground_color(self, padded: Tensor) -> Tensor:
+    def _compute_ground_color(self, padded: Tensor) -> Tensor:
         """Return the base color (n, 3) of the ground's texels.
 
         A photographed one has that which shows the photograph under the open sky.

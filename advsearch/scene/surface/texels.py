@@ -273,7 +273,7 @@ def make_lookup_matrix(
     rows, columns = np.nonzero(fine_charts.distance <= BORDER_TEXELS)
     points = position[rows, columns]
     point_normals = normal[rows, columns]
-    texel_width = _texel_width(charts, vertices)
+    texel_width = _compute_texel_width(charts, vertices)
     n_rows, n_columns = charts.is_covered.shape
     # centers of the finer cells in the grid of the charts
     grid_position = (
@@ -319,7 +319,7 @@ def _make_sparse(
     return to_torch_csr(scipy.sparse.coo_matrix(entries, size).tocsr())
 
 
-def _texel_width(charts: Charts, vertices: Float32Array) -> float:
+def _compute_texel_width(charts: Charts, vertices: Float32Array) -> float:
     """Return the mean width of a texel in world space, for vertices (V, 3) there.
 
     The mesh is scaled evenly to the world, so that the ratio of extents is that of
@@ -460,8 +460,8 @@ def prepare_sky(padded: Tensor) -> SkyLight:
         remaining = radiance
     return SkyLight(
         padded=padded,
-        cells=_pool(remaining, sine, SKY_SHAPE).reshape(-1, 3),
-        map=_pool(radiance, sine, BLURRED_SHAPE),
+        cells=_average_cells(remaining, sine, SKY_SHAPE).reshape(-1, 3),
+        map=_average_cells(radiance, sine, BLURRED_SHAPE),
         hot=hot,
     )
 
@@ -523,7 +523,7 @@ def _to_direction(polar: Tensor, azimuth: Tensor, dim: int) -> Tensor:
     return torch.stack([x, polar.cos(), z], dim=dim)
 
 
-def _pool(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
+def _average_cells(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
     """Return mean radiance by solid angle in the cells of a coarser map.
 
     Radiance is (H, W, 3), the solid angles (H, W); the result is (*size, 3).

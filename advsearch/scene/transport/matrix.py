@@ -245,8 +245,8 @@ class TextureTransport:
             -(-texture_shape[0] // CELL_SIZE),
             -(-texture_shape[1] // CELL_SIZE),
         )
-        cell_heights = _cell_sizes(texture_shape[0], self._cell_shape[0])
-        cell_widths = _cell_sizes(texture_shape[1], self._cell_shape[1])
+        cell_heights = _compute_cell_sizes(texture_shape[0], self._cell_shape[0])
+        cell_widths = _compute_cell_sizes(texture_shape[1], self._cell_shape[1])
         self._texels_in_cell = (cell_heights[:, None] * cell_widths[None, :])[
             :, :, None
         ]
@@ -368,7 +368,7 @@ class TextureTransport:
         )
 
 
-def _cell_sizes(n_texels: int, n_cells: int) -> Tensor:
+def _compute_cell_sizes(n_texels: int, n_cells: int) -> Tensor:
     """Return how many texels each cell has along one axis; the last may have fewer."""
     first_texels = CELL_SIZE * torch.arange(n_cells)
     return (n_texels - first_texels).clamp(max=CELL_SIZE).float()

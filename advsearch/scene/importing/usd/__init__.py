@@ -74,7 +74,7 @@ def convert_usd(path: Path, data: bytes) -> bytes:
             env=None,
         )
         if process.returncode or not target.is_file():
-            raise _conversion_error(path, process.stderr, process.returncode)
+            raise _make_conversion_error(path, process.stderr, process.returncode)
         for name in json.loads(process.stdout.splitlines()[-1]):
             stored_files.record_opened(name)
         return stored_files.read_bytes(
@@ -82,7 +82,7 @@ def convert_usd(path: Path, data: bytes) -> bytes:
         )
 
 
-def _conversion_error(
+def _make_conversion_error(
     path: Path, stderr: str, returncode: int
 ) -> errors.FileFormatError:
     """Return the error of a conversion that failed, by the last line of its output."""

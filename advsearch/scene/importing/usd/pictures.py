@@ -145,7 +145,7 @@ def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
         raise ValueError("an interlaced PNG of 16 bits; save it without interlacing")
     pixel_size = 2 * channels
     row_size = 1 + width * pixel_size
-    compressed = _png_data(data)
+    compressed = _join_png_data(data)
     try:
         row_bytes = zlib.decompressobj().decompress(compressed, height * row_size)
     except zlib.error as error:
@@ -174,7 +174,7 @@ def _expand_to_rgba(values: Array) -> Array:
     return np.concatenate([colors, alpha], axis=2)
 
 
-def _png_data(data: bytes) -> bytes:
+def _join_png_data(data: bytes) -> bytes:
     """Return the concatenated IDAT chunks of a PNG file."""
     content = bytearray()
     position = 8
