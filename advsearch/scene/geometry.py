@@ -37,7 +37,9 @@ from advsearch.scene.rigged import PERSON_PARAMETERS as PERSON_PARAMETERS
 from advsearch.scene.rigged import TIME as TIME
 from advsearch.scene.rigged import find_rig_parameter as find_rig_parameter
 from advsearch.scene.settings import ORBIT_CAMERA, POSE, SETTINGS
-from advsearch.scene.skeleton import rotation_entries as rotation_entries
+from advsearch.scene.skeleton import (
+    compute_rotation_entries as compute_rotation_entries,
+)
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription

@@ -23,7 +23,7 @@ from advsearch.scene.assets import Float64Array, make_pose
 from advsearch.scene.camera_files import LENS_KEYS, MAX_JSON_SIZE, read_camera
 from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.geometry import make_rotation
-from advsearch.scene.skeleton import rotation_entries
+from advsearch.scene.skeleton import compute_rotation_entries
 from advsearch.trust.stored_files import (
     parse_json,
     parse_text,
@@ -414,7 +414,7 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
             f"{where}: expected a quaternion of length 1, got one of {length:.3g}"
         )
     rotation = np.reshape(
-        rotation_entries(x / length, y / length, z / length, w / length), (3, 3)
+        compute_rotation_entries(x / length, y / length, z / length, w / length), (3, 3)
     )
     return np.asarray(np.linalg.inv(make_pose(rotation, shift)), np.float64)
 

@@ -30,7 +30,7 @@ from advsearch.scene.skeleton import (
     Clip,
     Movable,
     Track,
-    rotation_entries,
+    compute_rotation_entries,
     with_ancestors,
 )
 
@@ -491,5 +491,5 @@ def slerp(start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
 
 def quaternions_to_matrices(quaternions: Tensor) -> Tensor:
     """Return the rotations (N, 3, 3) of unit quaternions (N, 4), x, y, z, w."""
-    entries = rotation_entries(*quaternions.unbind(dim=1))
+    entries = compute_rotation_entries(*quaternions.unbind(dim=1))
     return torch.stack(entries, dim=1).reshape(-1, 3, 3)

@@ -29,7 +29,7 @@ from advsearch.scene.skeleton import (
     MorphTarget,
     Skeleton,
     Track,
-    rotation_entries,
+    compute_rotation_entries,
     with_ancestors,
 )
 from advsearch.trust.stored_files import check_most
@@ -76,7 +76,7 @@ def compute_matrix(node: Node) -> Float64Array:
     # the norm of 1.0 is 1: that of the identity, which no rotation means
     length = max(float(np.linalg.norm(node.rotation or 1.0)), 1e-12)
     quaternion = np.array(node.rotation or [0.0, 0.0, 0.0, 1.0]) / length
-    rotation = np.reshape(rotation_entries(*quaternion), (3, 3))
+    rotation = np.reshape(compute_rotation_entries(*quaternion), (3, 3))
     matrix[:3, :3] = rotation * np.array(node.scale or [1.0, 1.0, 1.0])
     matrix[:3, 3] = node.translation or [0.0, 0.0, 0.0]
     return matrix
