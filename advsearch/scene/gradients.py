@@ -174,7 +174,7 @@ class GradientPlan:
     groups: tuple[Group, ...]  # of all controls, in the order of u
     spp: int | None = None  # samples per pixel of differences; None is the primal's
 
-    def groups_with(self, *estimators: str) -> tuple[Group, ...]:
+    def select_groups(self, *estimators: str) -> tuple[Group, ...]:
         """Return the groups that use one of these estimators."""
         return tuple(group for group in self.groups if group.estimator in estimators)
 
@@ -190,7 +190,7 @@ class GradientPlan:
         It is 1 where the derivative runs back through scene inputs or the image.
         """
         mask = torch.zeros(sum(group.size for group in self.groups))
-        for group in self.groups_with(*ADJOINT_ESTIMATORS, "image"):
+        for group in self.select_groups(*ADJOINT_ESTIMATORS, "image"):
             mask[group.coordinates] = 1.0
         return mask
 
