@@ -412,7 +412,7 @@ class Notes:
                 yield f"{self.source}: {kind} {format_name(name)}{times} is left out"
 
 
-def last_line(output: str) -> str:
+def get_last_line(output: str) -> str:
     """Return the last line of a program's output after a colon, "" if there is none."""
     lines = [line for line in output.splitlines() if line.strip()]
     return f": {format_name(lines[-1].strip(), quoted=False)}" if lines else ""
