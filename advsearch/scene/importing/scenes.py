@@ -336,7 +336,7 @@ def _group_by_node(parts: Iterable[ImportedPart]) -> dict[int, list[ImportedPart
 
 
 @np.errstate(all="ignore")
-def contents(path: Path) -> Contents:
+def list_contents(path: Path) -> Contents:
     """Return what can be imported from a mesh or glTF file.
 
     Mitsuba's files have a function of the same name in their own module.
