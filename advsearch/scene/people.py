@@ -34,60 +34,89 @@ from advsearch.options import Value
 from advsearch.scene.settings import Parameter
 
 AGES = (10.0, 25.0, 90.0)  # years of MakeHuman's child, young and old
-_body_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
+_make_body_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
 
 
 def _make_joint_parameter(name: str, low: float, high: float, text: str) -> Parameter:
     """Return the parameter of a joint's angle, 0 by default."""
-    return _body_parameter(name, "degrees", low, high, 0.0, text)
+    return _make_body_parameter(
+        name, unit="degrees", low=low, high=high, default=0.0, text=text
+    )
 
 
 PHENOTYPE = (
-    _body_parameter(
-        "height", "metres", 1.0, 2.1, 1.7, "Height without shoes and hair.", (1.5, 1.95)
+    _make_body_parameter(
+        "height",
+        unit="metres",
+        low=1.0,
+        high=2.1,
+        default=1.7,
+        text="Height without shoes and hair.",
+        search=(1.5, 1.95),
     ),
-    _body_parameter(
+    _make_body_parameter(
         "weight",
-        "1",
-        0.0,
-        1.0,
-        0.5,
-        "0 is thin, 0.5 average, 1 heavy; `body.mass` says kilograms.",
-        (0.2, 0.8),
+        unit="1",
+        low=0.0,
+        high=1.0,
+        default=0.5,
+        text="0 is thin, 0.5 average, 1 heavy; `body.mass` says kilograms.",
+        search=(0.2, 0.8),
     ),
-    _body_parameter(
+    _make_body_parameter(
         "age",
-        "years",
-        10.0,
-        90.0,
-        35.0,
-        "Age; children are smaller by `height` only.",
-        (18.0, 75.0),
+        unit="years",
+        low=10.0,
+        high=90.0,
+        default=35.0,
+        text="Age; children are smaller by `height` only.",
+        search=(18.0, 75.0),
     ),
-    _body_parameter(
+    _make_body_parameter(
         "gender",
-        "1",
-        0.0,
-        1.0,
-        1.0,
-        "0 is a woman, 1 a man, between them a mixture.",
-        (0.0, 1.0),
+        unit="1",
+        low=0.0,
+        high=1.0,
+        default=1.0,
+        text="0 is a woman, 1 a man, between them a mixture.",
+        search=(0.0, 1.0),
     ),
 )
 WALK = (
-    _body_parameter("walk", "degrees", -3600.0, 3600.0, 0.0, "Phase of a walk: the left heel "
-                                                      "strikes at 0, the right at 180.",
-             (0.0, 360.0), periodic=True),
-    _body_parameter("stride", "1", 0.0, 1.3, 0.0, "How far the walk swings: 0 stands, "
-                                                  "1 is an "
-                                           "ordinary step.", (0.0, 1.0)),
-)  # fmt: skip
+    _make_body_parameter(
+        "walk",
+        unit="degrees",
+        low=-3600.0,
+        high=3600.0,
+        default=0.0,
+        text="Phase of a walk: the left heel strikes at 0, the right at 180.",
+        search=(0.0, 360.0),
+        periodic=True,
+    ),
+    _make_body_parameter(
+        "stride",
+        unit="1",
+        low=0.0,
+        high=1.3,
+        default=0.0,
+        text="How far the walk swings: 0 stands, 1 is an ordinary step.",
+        search=(0.0, 1.0),
+    ),
+)
 SPINE = (
-    _make_joint_parameter("spine", -20.0, 60.0, "Bend of the back, ahead."),
-    _make_joint_parameter("spine_side", -25.0, 25.0, "Bend of the back to the left."),
-    _make_joint_parameter("spine_turn", -35.0, 35.0, "Turn of the chest to the left."),
-    _make_joint_parameter("neck", -45.0, 45.0, "Nod of the head, ahead."),
-    _make_joint_parameter("neck_turn", -70.0, 70.0, "Turn of the head to the left."),
+    _make_joint_parameter(
+        "spine", low=-20.0, high=60.0, text="Bend of the back, ahead."
+    ),
+    _make_joint_parameter(
+        "spine_side", low=-25.0, high=25.0, text="Bend of the back to the left."
+    ),
+    _make_joint_parameter(
+        "spine_turn", low=-35.0, high=35.0, text="Turn of the chest to the left."
+    ),
+    _make_joint_parameter("neck", low=-45.0, high=45.0, text="Nod of the head, ahead."),
+    _make_joint_parameter(
+        "neck_turn", low=-70.0, high=70.0, text="Turn of the head to the left."
+    ),
 )
 LIMBS = (
     ("shoulder", -50.0, 170.0, "arm, raised ahead"),
@@ -101,7 +130,9 @@ LIMBS = (
 )
 """Joints on both sides, with their limits in degrees."""
 _JOINTS = tuple(
-    _make_joint_parameter(f"{side}_{name}", low, high, f"{side.capitalize()} {text}.")
+    _make_joint_parameter(
+        f"{side}_{name}", low=low, high=high, text=f"{side.capitalize()} {text}."
+    )
     for side in ("left", "right")
     for name, low, high, text in LIMBS
 )

@@ -37,15 +37,15 @@ from advsearch.scene.skeleton import (
 AXES = ("x", "y", "z")
 PERSON_PARAMETERS = PARAMETERS  # all parameters of a person
 WEIGHT = "weight"
-_rig_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
-TIME = _rig_parameter(
+_make_rig_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
+TIME = _make_rig_parameter(
     "time",
-    "1",
-    0.0,
-    1.0,
-    0.0,
-    "Of the clip of a rigged file: 0 is its beginning, 1 its end.",
-    (0.0, 1.0),
+    unit="1",
+    low=0.0,
+    high=1.0,
+    default=0.0,
+    text="Of the clip of a rigged file: 0 is its beginning, 1 its end.",
+    search=(0.0, 1.0),
 )
 # Cosine of the angle between rotations beyond which arc and chord are the same.
 MAX_ARC_COSINE = 1.0 - 1e-9
@@ -59,16 +59,21 @@ def find_rig_parameter(name: str) -> Parameter | None:
     if not (owner and dot and component in (*AXES, WEIGHT)):
         return None
     if component == WEIGHT:
-        return _rig_parameter(
-            name, "1", 0.0, 1.0, 0.0, f"How much of the morph target {owner} there is."
+        return _make_rig_parameter(
+            name,
+            unit="1",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            text=f"How much of the morph target {owner} there is.",
         )
-    return _rig_parameter(
+    return _make_rig_parameter(
         name,
-        "degrees",
-        -360.0,
-        360.0,
-        0.0,
-        f"Turn of the joint {owner} about {component}.",
+        unit="degrees",
+        low=-360.0,
+        high=360.0,
+        default=0.0,
+        text=f"Turn of the joint {owner} about {component}.",
     )
 
 
