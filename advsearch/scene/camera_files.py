@@ -374,7 +374,10 @@ def _list_frames(data: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _select_other_entries(frames: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the entries of frames that are about neither the lens nor the scene."""
+    """Return the entries of frames that are about neither the lens nor the scene.
+
+    Of entries of one name that of the last frame wins.
+    """
     other_entries = {}
     for frame in frames:
         for key, value in frame.items():

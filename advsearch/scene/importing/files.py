@@ -228,6 +228,7 @@ def _make_missing_file_hint(path: Path, suffixes: Sequence[str]) -> str:
     hint = ""
     if not path.parent.is_dir():
         hint = f" The folder {path.parent} does not exist either."
+    # A folder that does not exist, or may not be read, has no similar names to offer.
     with suppress(OSError):
         name_by_lower_case = {
             file.name.lower(): file.name

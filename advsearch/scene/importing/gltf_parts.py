@@ -445,7 +445,9 @@ class GltfSurfaces:
     ) -> Float32Array | None:
         """Return the texels (H, W, C) of a texture; None, and a note, if it has none.
 
-        A texture that is not to be filtered is enlarged by repeating its texels.
+        `words` is the note, with `{name}` for the image and `{why}` for the reason. Of
+        a texture that is not to be filtered each texel is repeated, so that filtering
+        is not visible; a large one is filtered, with a note.
         """
         if use is None:
             return None
@@ -473,10 +475,10 @@ class GltfSurfaces:
         if texels is None or not is_sharp or texels.shape[:2] == (1, 1):
             return texels
         # At this size, filtering is not visible.
-        sharp_size = min(self._images.max_side, TEXTURE_LIMIT) // 2
-        repeats = sharp_size // max(texels.shape[:2])
+        max_sharp_size = min(self._images.max_side, TEXTURE_LIMIT) // 2
+        repeats = max_sharp_size // max(texels.shape[:2])
         if repeats < 2:
-            self.notes.warn(BLURRED_NOTE.format(most=sharp_size // 2))
+            self.notes.warn(BLURRED_NOTE.format(most=max_sharp_size // 2))
             return texels
         return texels.repeat(repeats, axis=0).repeat(repeats, axis=1)
 

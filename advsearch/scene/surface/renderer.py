@@ -291,8 +291,8 @@ class SurfaceRenderer(Predictor):
         """
         images = list[Tensor]()
         with torch.no_grad():
-            for begin in range(0, len(us), self.batch_size):
-                batch = us[begin : begin + self.batch_size]
+            for start in range(0, len(us), self.batch_size):
+                batch = us[start : start + self.batch_size]
                 inputs = [self.compute_inputs(u) for u in batch]
                 images += self.compose_images(
                     self.trace_views(inputs), inputs, self.base_color, batch

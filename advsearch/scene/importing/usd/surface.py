@@ -765,6 +765,7 @@ class PreviewSurface:
         """Return display values (H, W, 3 or 4) of color and opacity.
 
         None if neither image can be read. `factor` is the color if it has no image.
+        Images of two sizes are both resized to the larger width and the larger height.
         """
         colors = None if color_use is None else self.surfaces.compute_values(color_use)
         opacities = (
@@ -776,17 +777,17 @@ class PreviewSurface:
             colors = np.broadcast_to(
                 np.array(factor, np.float32), (*opacities.shape[:2], 3)
             )
-        levels = color.linear_to_srgb(
+        display_colors = color.linear_to_srgb(
             np.broadcast_to(colors, (*colors.shape[:2], 3)).astype(np.float32)
         )
         if opacities is None:
-            return levels
-        if opacities.shape[:2] != levels.shape[:2]:
-            width = max(opacities.shape[1], levels.shape[1])
-            height = max(opacities.shape[0], levels.shape[0])
+            return display_colors
+        if opacities.shape[:2] != display_colors.shape[:2]:
+            width = max(opacities.shape[1], display_colors.shape[1])
+            height = max(opacities.shape[0], display_colors.shape[0])
             opacities = _resize(opacities, (width, height))
-            levels = _resize(levels, (width, height))
-        return np.concatenate([levels, opacities[:, :, :1]], axis=2)
+            display_colors = _resize(display_colors, (width, height))
+        return np.concatenate([display_colors, opacities[:, :, :1]], axis=2)
 
     def _add_roughness_and_metallic(
         self, surface: dict[str, Any], *, is_specular: bool
