@@ -52,12 +52,12 @@ def file(args: argparse.Namespace) -> int:
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with open_command_progress(as_json=True, quiet=False):
         # late: another thing has this name here
-        from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, contents
+        from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, list_contents
 
         if Path(args.file).suffix.lower() == MITSUBA_SUFFIX:
             facts, lines = _describe_mitsuba_file(args.file, out)
         else:
-            inside = contents(Path(args.file))
+            inside = list_contents(Path(args.file))
             facts, lines = _describe_mesh_file(args.file, inside)
             if out is not None:
                 advsearch.render(

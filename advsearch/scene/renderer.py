@@ -385,7 +385,7 @@ class Renderer:
         noise_seed = seeds.stream(self.root_seed, "differences", seed)
         difference_spp = self.plan.spp or spp
         with torch.no_grad():
-            for group in self.plan.groups_with("secant"):
+            for group in self.plan.select_groups("secant"):
                 write_central_differences(
                     lambda at: loss(self._render_image(at, noise_seed, difference_spp)),
                     group,
@@ -596,7 +596,7 @@ class Renderer:
 
     def _groups_by_differences(self) -> tuple[Group, ...]:
         """Return the groups that use differences."""
-        return self.plan.groups_with(*(DIFFERENCE_ESTIMATORS - self._left_out))
+        return self.plan.select_groups(*(DIFFERENCE_ESTIMATORS - self._left_out))
 
     def compute_differences(
         self, u: Tensor, cotangent: Tensor, seed: int, spp: int
@@ -797,7 +797,7 @@ def _reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:
     Of the interior adjoint, only those that it differentiates correctly count.
     """
     reached: frozenset[str] = frozenset()
-    for group in renderer.plan.groups_with(estimator):
+    for group in renderer.plan.select_groups(estimator):
         reached |= renderer.routes.get(group.name, frozenset())
     return (
         reached & renderer.scene.interior_inputs if estimator == "adjoint" else reached

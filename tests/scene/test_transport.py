@@ -147,7 +147,7 @@ def test_what_is_kept_small_says_the_same(texture: tuple[int, int], bytes_an_ent
     cotangent = torch.ones(1, 2, 3)
     both = small.multiply_transposed(cotangent), made.multiply_transposed(cotangent)
     torch.testing.assert_close(*both, rtol=2 * HALF, atol=1e-6)
-    assert small.bytes == bytes_an_entry * small._first.entries + 2 * (4 + 6) * 2
+    assert small.bytes == bytes_an_entry * small._sharp.entries + 2 * (4 + 6) * 2
 
 
 def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for() -> None:

@@ -138,7 +138,7 @@ class Waypoints:
         quaternion = self.interpolate(time, self.rotations)
         quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(1e-9)
         entries = torch.stack(
-            geometry.rotation_entries(*quaternion.unbind(dim=-1)), dim=-1
+            geometry.compute_rotation_entries(*quaternion.unbind(dim=-1)), dim=-1
         )
         return entries.reshape(*entries.shape[:-1], 3, 3)
 

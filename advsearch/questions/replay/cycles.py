@@ -459,7 +459,7 @@ class _Process:
         while not path.is_file():
             if self._process.poll() is not None and not path.is_file():
                 log = self._log.read_text("utf-8", "replace")
-                raise BlenderError(f"Blender stopped{workbench.last_line(log)}")
+                raise BlenderError(f"Blender stopped{workbench.get_last_line(log)}")
             if time.monotonic() > deadline:
                 raise BlenderError(
                     f"Blender had not rendered it after {time_limit} seconds"

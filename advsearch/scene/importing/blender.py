@@ -76,7 +76,7 @@ def convert_blend(path: Path, data: bytes) -> bytes:
                 f"{program[0]}"
             ) from error
         if process.returncode or not target.is_file():
-            last = reading.last_line(process.stdout + process.stderr)
+            last = reading.get_last_line(process.stdout + process.stderr)
             raise errors.FileFormatError(
                 f"{path}: Blender could not read it{last}; export glTF (.glb) from it "
                 "yourself"

@@ -64,7 +64,10 @@ Version = tuple[int, ...]
 
 @dataclass(frozen=True)
 class LibraryFile:
-    """A libLLVM file."""
+    """A libLLVM file.
+
+    As text it is its path, and in parentheses its version and why it is refused.
+    """
 
     path: Path
     version: Version  # major first, or ()
@@ -90,7 +93,7 @@ def find_libraries(
     Returns:
         Usable files first, each group newest first.
     """
-    patterns = [*_PATTERNS, *_conda_patterns(environ.get("CONDA_PREFIX", ""))]
+    patterns = [*_PATTERNS, *_list_conda_patterns(environ.get("CONDA_PREFIX", ""))]
     paths: list[Path] = []
     for pattern in patterns:
         matches = root.glob(pattern)
@@ -109,7 +112,7 @@ def find_libraries(
     )
 
 
-def _conda_patterns(prefix: str) -> list[str]:
+def _list_conda_patterns(prefix: str) -> list[str]:
     """Return patterns for an active conda environment, relative to the root."""
     if not prefix:
         return []

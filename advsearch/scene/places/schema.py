@@ -31,10 +31,12 @@ class _Entry(BaseModel):
 
 
 def _is_convex(corners: Float64Array) -> bool:
-    """Return whether corners (K, 2), in turn, turn to one side only, and hold an
-    area.
+    """Return whether corners (K, 2), in turn, turn to one side only, and hold an area.
+
+    Either side will do; a corner on a straight line does not count, within rounding.
     """
     edges = np.roll(corners, -1, axis=0) - corners
+    # cross products of successive edges
     turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
         edges[:, 0], -1
     )
@@ -107,6 +109,7 @@ class ValidEntry(_Entry):
 
     @model_validator(mode="after")
     def _check_order(self) -> ValidEntry:
+        """Check that bounds have the lower one first."""
         for axis, bounds in (("x", self.x), ("y", self.y), ("z", self.z)):
             if bounds is not None and bounds[0] >= bounds[1]:
                 raise ValueError(f"{axis}: expected the lower bound first")
@@ -125,6 +128,7 @@ class PictureEntry(_Entry):
 
     @model_validator(mode="after")
     def _check_inside(self) -> PictureEntry:
+        """Check that the object, at 0, is between the bounds."""
         for axis, (low, high) in (("x", self.x), ("y", self.y)):
             if not low < 0.0 < high:
                 raise ValueError(
