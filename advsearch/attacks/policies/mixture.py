@@ -51,6 +51,12 @@ class Ranges:
     n_options: Tensor
     is_periodic: Tensor
 
+    def find_option(self, x: Tensor, max_options: int) -> Tensor:
+        """Return the index (n, d) of the option that points x (n, d) lie in; 0 for a
+        number.
+        """
+        return (x * self.n_options).long().clamp(max=max_options - 1)
+
     def compute_offset(self, x: Tensor, mean: Tensor) -> Tensor:
         """Return the offset of x from a mean; for an angle the shorter way round, in
         [-0.5, 0.5).
@@ -122,7 +128,7 @@ class Components:
         """
         n_points = len(x)
         n_components, _, max_options = self.option_probs.shape
-        option = (x * ranges.n_options).long().clamp(max=max_options - 1)  # (n, d)
+        option = ranges.find_option(x, max_options)  # (n, d)
         index = option[:, None, :, None].expand(-1, n_components, -1, 1)
         probs = self.option_probs.expand(n_points, *self.option_probs.shape)
         prob = probs.gather(3, index)[..., 0]  # (n, k, d)
@@ -176,8 +182,7 @@ class Components:
         means, stds = self._divide_out_prior(
             mean_offset, variance, counts[:, None], ranges
         )
-        max_options = uniform_probs.shape[2]
-        option = (x * ranges.n_options).long().clamp(max=max_options - 1)  # (n, d)
+        option = ranges.find_option(x, max_options=uniform_probs.shape[2])
         option_probs = _estimate_option_probs(
             sample_weights, option, counts, uniform_probs
         )
@@ -233,8 +238,9 @@ def _estimate_option_probs(
         counts: (k,) samples of each component.
         uniform_probs: (k, d, m) uniform probabilities.
     """
-    one_hot = torch.nn.functional.one_hot(option, uniform_probs.shape[2]).double()
-    frequency = torch.einsum("kn,ndo->kdo", sample_weights, one_hot)
+    max_options = uniform_probs.shape[2]
+    indicator = torch.nn.functional.one_hot(option, max_options).double()  # (n, d, m)
+    frequency = torch.einsum("kn,ndo->kdo", sample_weights, indicator)
     n_samples = counts[:, None, None]
     return (n_samples * frequency + PRIOR_COUNT * uniform_probs) / (
         n_samples + PRIOR_COUNT

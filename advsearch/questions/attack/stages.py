@@ -26,7 +26,7 @@ from advsearch.attacks import (
 )
 from advsearch.attacks.candidates import (
     ATTEMPTS,
-    MOST_CHECKS,
+    MAX_CHECKS,
     ROUNDS,
     confirm_bracket,
     find_smallest_change,
@@ -580,7 +580,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         # what was found if this is interrupted
         findings.search = findings.search or results[0]
         verifier.begin_stage(
-            "trying smaller changes", MOST_CHECKS * n_trials, at_most=True
+            "trying smaller changes", MAX_CHECKS * n_trials, at_most=True
         )
         return result.best_u
 
