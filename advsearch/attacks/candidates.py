@@ -330,9 +330,9 @@ def select_diverse(
 RATIO = 1.05  # the bracket is closed once high / low is at most this
 SMALLEST_SCALE = 1e-3  # no smaller scale than this is tried
 
-ROUNDS = 12  # maximum number of searches
+MAX_SEARCHES = 12
 
-ATTEMPTS = 6  # maximum number of steps outwards of `confirm_bracket`
+MAX_CONFIRMATIONS = 6  # steps outwards of `confirm_bracket`
 
 LENGTH_RATIO = 1.0 + (RATIO - 1.0) / 5.0
 """Ratio of the bounds at which the bisection of a configuration's length ends; it
@@ -429,7 +429,7 @@ def find_smallest_change(
        its length, to the shortest that passes: a handful of trials, no search.
     3. A search at half the scale reached, then at the geometric mean of the bracket's
        ends; each configuration that passes is shortened as in 2, each that fails raises
-       the lower end; until the bracket is closed, or after `ROUNDS`.
+       the lower end; until the bracket is closed, or after `MAX_SEARCHES`.
 
     For a linear model and a gradient policy the first search points the right way and 2
     ends within its own step of the optimum, so that the result is within `RATIO` of the
@@ -452,7 +452,7 @@ def find_smallest_change(
         return replace(state, low=1.0)
     state = _shorten(state, u, 1.0, passes, domain, likely)
     while (
-        state.searches < ROUNDS
+        state.searches < MAX_SEARCHES
         and state.high > RATIO * state.low
         and state.high > SMALLEST_SCALE
     ):
@@ -483,7 +483,7 @@ def confirm_bracket(
 
     What lies exactly on the edge passes its trials by chance. If it fails, its change
     is lengthened by the square root of `RATIO`, about 2.5 %, and it is tried again. The
-    scale never exceeds 1. After `ATTEMPTS` the bracket is returned unconfirmed, with a
+    scale never exceeds 1. After `MAX_CONFIRMATIONS` the bracket is returned unconfirmed, with a
     configuration that was lengthened once more and not tried.
     """
     if bracket.u is None:
@@ -491,7 +491,7 @@ def confirm_bracket(
     shortest_u = bracket.u
     shortest_scale = bracket.high
     growth = 1.0
-    for _ in range(ATTEMPTS):
+    for _ in range(MAX_CONFIRMATIONS):
         if all(passes(bracket.u, bracket.checks + repeat) for repeat in range(times)):
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
         growth *= math.sqrt(RATIO)

@@ -383,7 +383,7 @@ def list_look_sizes(trials: int = 0) -> tuple[int, ...]:
     return LOOK_SIZES
 
 
-def most_samples(
+def count_max_samples(
     configurations: int, ladder: Sequence[int] = LADDER, trials: int = 0
 ) -> int:
     """Return the maximum number of samples per pixel that `choose_spp` renders in all.
