@@ -23,7 +23,8 @@ NORMS: tuple[str, ...] = get_args(Norm)
 
 TOLERANCE = 2e-6
 """How far outside its budget float32 rounding may put a configuration, absolute in u
-and relative to the radius; beside `Block.rounding`, which adds up in an l2 norm.
+and relative to the radius; besides `Block.compute_rounding`, which adds up in an l2
+norm.
 """
 
 

@@ -455,7 +455,7 @@ def _spread_directions(
 ) -> assets.Float64Array:
     """Return unit directions (N, 3) in which a lens sees a part of the image.
 
-    They are spread as those of `Silhouette.directions`.
+    They are spread as those of `Silhouette.list_directions`.
 
     Args:
         model: of the camera.
