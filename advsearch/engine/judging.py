@@ -226,7 +226,7 @@ def add_visible_things(judgement: Judgement, things: JsonObject | None) -> Judge
     visible or not. What the task states of a thing itself wins. A judgement of a NaN
     prediction stays as it is.
     """
-    if things is None or judgement.is_not_a_number:
+    if things is None or judgement.is_non_finite:
         return judgement
     payload = judgement.payload if isinstance(judgement.payload, dict) else {}
     stated_by_task: Any = payload.get("things", {})

@@ -104,7 +104,7 @@ class Judgement:
         return get_outcome(self.payload)
 
     @property
-    def is_not_a_number(self) -> bool:
+    def is_non_finite(self) -> bool:
         """Whether the model returned NaN or infinity, neither right nor a success."""
         return self.prediction.label == NOT_A_NUMBER
 

@@ -295,7 +295,7 @@ class EnsembleTask(JointTask):
         """Join the models' judgements of one image."""
         worst = min(judgements, key=lambda judgement: judgement.margin)
         margin = worst.margin
-        if any(judgement.is_not_a_number for judgement in judgements):
+        if any(judgement.is_non_finite for judgement in judgements):
             margin = math.nan
         payload = None
         if any(judgement.payload is not None for judgement in judgements):
