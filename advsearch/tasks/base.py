@@ -85,8 +85,10 @@ class Judgement:
         prediction: Prediction,
         payload: JsonValue = None,
     ) -> Judgement:
-        """Create the judgement of an output; `NOT_A_NUMBER` if its margin is not
-        finite.
+        """Create the judgement of an output.
+
+        If its margin is not finite, the prediction is `NOT_A_NUMBER`, neither right nor
+        a success, without a payload.
         """
         if not math.isfinite(margin):
             not_a_number = Prediction(NOT_A_NUMBER)

@@ -403,7 +403,7 @@ class EachThingTask(JointTask):
     def describe(
         self, output: Output, truth: TruthByThing, margins: Sequence[float]
     ) -> list[PredictionWithPayload]:
-        """See `Task.said`: the prediction about the worst visible thing.
+        """See `Task.describe`: the prediction about the worst visible thing.
 
         The payload is that of the worst thing, with the judgement of each.
         """
