@@ -27,8 +27,8 @@ from advsearch.errors import InputError
 from advsearch.tasks.classification import (
     Labels,
     compute_largest_logit,
-    compute_target_lead,
-    compute_wrong_lead,
+    compute_misclassification_margin,
+    compute_target_margin,
     make_class_mask,
 )
 
@@ -52,14 +52,14 @@ def margin(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     unbounded, and with a gradient of one at every confidence (Carlini and Wagner 2017,
     f_6 without its hinge). Ties share the gradient.
     """
-    return compute_wrong_lead(logits, labels)
+    return compute_misclassification_margin(logits, labels)
 
 
 def targeted_margin(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     """max over t in T of z_t, minus max over j not in T of z_j: over 0 exactly where
     the prediction is in T.
     """
-    return compute_target_lead(logits, target)
+    return compute_target_margin(logits, target)
 
 
 def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:

@@ -46,9 +46,8 @@ It costs as much as some 6 rendered evaluations with gradients
 MIN_STEPS_PER_LIGHT = 8
 COMPARISON_INTERVAL = 20  # evaluations from one comparison to the next
 MIN_SCORES = 4  # trials from which a standard deviation is estimated
-LOWER_END_DEVIATIONS = (
-    1.64  # standard deviations below the mean above which 19 of 20 scores lie
-)
+# standard deviations below the mean above which 19 of 20 scores lie
+LOWER_END_DEVIATIONS = 1.64
 ADVICE = {
     RefusalCause.HAZE: "leave the haze out",
     RefusalCause.NOISE: "`denoise=oidn` takes the noise out",
@@ -117,7 +116,8 @@ class PredictedSearch(ABC):
         problem: of the searches.
         steps: evaluations of a search; those after them belong to the ranking, and are
             traced.
-        draws_conditions: whether each evaluation draws conditions; see `Domain.drawn`.
+        draws_conditions: whether each evaluation draws conditions; see
+            `Domain.draws_conditions`.
         deviations: from traced images, of each comparison.
         n_traced: images that were traced, for the predictor and to compare it.
         seconds: spent on both.
@@ -196,7 +196,7 @@ class PredictedSearch(ABC):
     def compare(self, compare_view: Callable[[int], ComparedView]) -> Deviation:
         """Compare predictions with traced images, and store the deviation.
 
-        `compare_view` compares a single view; see `acceptance.compared`.
+        `compare_view` compares a single view; see `acceptance.compare_views`.
         """
         with self.count_time():
             self.deviations.append(compare_views(compare_view))
@@ -309,10 +309,13 @@ class Transport(PredictedSearch):
         return replace(evaluation, predicted=1)
 
     def _update_predictor(self, query: Query) -> Predictor | None:
-        """Return the predictor of a query; None where it is traced.
+        """Return the predictor of a query; None if its image is traced.
 
-        Where that is due, the predictor is compared with traced images and, if it is
-        too far off, computed again.
+        Queries of the ranking and trials are traced. Every `COMPARISON_INTERVAL`
+        queries of a search the predictor is compared with traced images. If it is too
+        far off, it is computed again at the query's configuration; a predictor by basis
+        images of lights, which would be the same again, is given up and the rest of the
+        search is traced.
         """
         kind = query.kind
         number = query.number
@@ -353,9 +356,8 @@ class Transport(PredictedSearch):
         The bias is the predicted score minus the lower end of the trials' scores.
         """
         if len(scores) >= MIN_SCORES and all(map(math.isfinite, scores)):
-            lower_end = statistics.fmean(
-                scores
-            ) - LOWER_END_DEVIATIONS * statistics.stdev(scores)
+            mean = statistics.fmean(scores)
+            lower_end = mean - LOWER_END_DEVIATIONS * statistics.stdev(scores)
             self._score_bias = self._predict_score(u) - lower_end
 
     def _predict_score(self, u: Tensor) -> float:

@@ -36,7 +36,7 @@ OPERATORS: dict[Any, int] = {**CHANNELS_LAST, **CHANNELS_SECOND}
 activation.
 """
 
-# from a batch as `Model.batches` yields it, N images, to features (N, F)
+# from a batch as `Model.prepare` returns it, N images, to features (N, F)
 Read = Callable[[Tensor], Tensor]
 
 

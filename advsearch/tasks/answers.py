@@ -176,7 +176,7 @@ class FreeAnswer(Task):
         truth: Words,
         margins: Sequence[float],
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.said`: of several texts, the most frequent among those that
+        """See `Task.describe`: of several texts, the most frequent among those that
         decided.
 
         The payload has all of them.

@@ -111,7 +111,7 @@ class Segmentation(tasks.ClassTask):
         that lead, the deciding one is that at which `accuracy` of them is reached.
         """
         return self._compute_deciding_lead(
-            output, truth, tasks.compute_wrong_lead, truth.labels
+            output, truth, tasks.compute_misclassification_margin, truth.labels
         )
 
     def score(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
@@ -123,7 +123,7 @@ class Segmentation(tasks.ClassTask):
         return -self._compute_deciding_lead(
             output,
             truth,
-            lambda logits, labels: -tasks.compute_target_lead(logits, labels),
+            lambda logits, labels: -tasks.compute_target_margin(logits, labels),
             self.target,
         )
 
@@ -137,9 +137,9 @@ class Segmentation(tasks.ClassTask):
         if pixels is None:
             return _make_hidden_value(output)
         if self.target is None:
-            lead = tasks.compute_wrong_lead(pixels, truth.labels)
+            lead = tasks.compute_misclassification_margin(pixels, truth.labels)
         else:
-            lead = tasks.compute_target_lead(pixels, self.target)
+            lead = tasks.compute_target_margin(pixels, self.target)
         mean_lead = lead.reshape(len(output), -1).mean(dim=1)
         return -mean_lead if self.minimise else mean_lead
 
@@ -200,7 +200,7 @@ class Segmentation(tasks.ClassTask):
     def describe(
         self, output: Tensor, truth: SegmentationTruth, margins: Sequence[float]
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.said`: the class of most of the object's pixels.
+        """See `Task.describe`: the class of most of the object's pixels.
 
         If too few are right, it is the most frequent wrong class; if that is
         background, "no bottle", or "bottle in part" from `MIN_PARTIAL_ACCURACY` on. The
@@ -286,7 +286,7 @@ class Segmentation(tasks.ClassTask):
         """
         n_classes = logits.shape[0]
         pixels = logits.permute(1, 2, 0).reshape(-1, n_classes)
-        is_correct = tasks.compute_wrong_lead(pixels, truth.labels) <= 0.0
+        is_correct = tasks.compute_misclassification_margin(pixels, truth.labels) <= 0.0
         return is_correct.reshape(logits.shape[1:])
 
     def marks(self, output: Tensor, truth: SegmentationTruth) -> list[list[tasks.Mark]]:

@@ -301,7 +301,7 @@ def test_a_policy_that_knows_no_choices_never_sees_one() -> None:
 
         def propose(self, state: tuple[Domain, int], n: int) -> tuple[tuple[Proposal, ...], tuple[Domain, int]]:
             domain, count = state
-            return (Proposal(domain.project(domain.begin + 0.1 * count)),), (domain, count + 1)
+            return (Proposal(domain.project(domain.initial_point + 0.1 * count)),), (domain, count + 1)
 
         def update(self, state: tuple[Domain, int], evaluated: Evaluated) -> tuple[Domain, int]:
             assert all(u.shape == (1,) for u, _ in evaluated)

@@ -78,7 +78,7 @@ def test_it_is_the_same_for_rendered_and_for_predicted_pictures(
     settings = {"over": over, "draws": 2} if over else {}
     made = problem(scene, pinker, controls=TEXTURE, **settings)
     predicted: PredictedSearch = Bank(made, 16, partial(map, made.evaluate)) if over else Transport(made, 16)
-    at = made.domain.begin.clone().requires_grad_()
+    at = made.domain.initial_point.clone().requires_grad_()
     value = pinker(at, at, at, made.searched_space.get_printable_colors(at)["texture"][None])
     value.sum().backward()
     for one in (made, predicted):
@@ -99,7 +99,7 @@ def test_the_derivative_is_that_of_the_picture_and_that_of_what_was_asked_for(sc
         return seen(logits, images, labels) * (1.0 + 0.1 * configuration["pose.yaw"]) + own
 
     made = problem(scene, seen, controls={"texture": {"resolution": 8}, "pose": {"yaw": [-20, 30]}})
-    u = made.domain.begin
+    u = made.domain.initial_point
     picture = made.evaluate(Query(u, 3, phase="search", gradient=True))
     made.objective = get_objective(asks, made.task)
     found = made.evaluate(Query(u, 3, phase="search", gradient=True))

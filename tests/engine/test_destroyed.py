@@ -177,7 +177,7 @@ class Walking(Policy[Any]):
     in_place: bool = True
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Any:
-        return domain, domain.begin if self.in_place else domain.begin.clone()
+        return domain, domain.initial_point if self.in_place else domain.initial_point.clone()
 
     def propose(self, state: Any, n: int) -> tuple[tuple[Proposal, ...], Any]:
         domain, u = state

@@ -907,8 +907,8 @@ def test_reference_files_that_are_wrong(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"the reference model is not there .* run `make reference`"):
         reference.load(tmp_path)
     training.save(tmp_path, reference.build(3).state_dict(), ["a", "b", "c"])
-    record = json.loads((tmp_path / reference.RECORD).read_text())
-    (tmp_path / reference.RECORD).write_text(json.dumps({**record, "labels": ["a", "b"]}))
+    record = json.loads((tmp_path / reference.METADATA).read_text())
+    (tmp_path / reference.METADATA).write_text(json.dumps({**record, "labels": ["a", "b"]}))
     with pytest.raises(ModelError, match=r"are of another network; run `make reference`"):
         reference.load(tmp_path)
     (tmp_path / reference.WEIGHTS).write_bytes(b"short")

@@ -108,7 +108,7 @@ def test_the_margin_is_the_largest_difference_in_envelopes_less_one() -> None:
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_an_action_that_is_no_number_is_neither_right_nor_a_success(bad: float) -> None:
     (judgement,) = judged().judge(torch.tensor([[bad, -0.2]]), torch.tensor([0.1, -0.2]))
-    assert judgement.is_not_a_number and not judgement.right and not judgement.success and judgement.payload is None
+    assert judgement.is_non_finite and not judgement.right and not judgement.success and judgement.payload is None
     with pytest.raises(InputError, match="the clean action has NaN or infinity"):
         Command(envelope=1).after_calibration(torch.tensor([[bad]]), None)
 

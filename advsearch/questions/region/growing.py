@@ -257,7 +257,7 @@ class RegionSearch:
         (trial,) = self._verifier.try_configurations(
             "region", {number: u}, has_success=False, predictor=predictor
         )
-        is_counted = not trial.prediction.is_out_of_view and not trial.is_not_a_number
+        is_counted = not trial.prediction.is_out_of_view and not trial.is_non_finite
         return is_counted and trial.success == self._centre_verdict
 
 
@@ -281,7 +281,7 @@ def find_verdict(verifier: workbench.Verifier, centre: Tensor) -> bool:
             "the centre, so there is no "
             "verdict; choose another centre"
         )
-    n_without_number = sum(trial.is_not_a_number for trial in trials)
+    n_without_number = sum(trial.is_non_finite for trial in trials)
     if n_without_number:
         raise InputError(
             f"the model's prediction is not a number in {n_without_number} of "

@@ -237,7 +237,7 @@ def test_an_angle_is_searched_across_its_seam() -> None:
 def test_coordinates_go_to_the_box_and_back() -> None:
     domain = domain_of((BALL, Block(2, low=0.25, high=0.75), CHOICE, Block(1, periodic=True)))
     box = find_box_coordinates(domain)
-    assert box.where.tolist() == [40, 41, 42, 43]
+    assert box.indices.tolist() == [40, 41, 42, 43]
     x = torch.tensor([0.0, 1.0, 0.375, 0.9])
     u = box.to_configuration(domain.start, x)
     assert torch.allclose(u[40:], torch.tensor([0.25, 0.75, 0.375, 0.9]))

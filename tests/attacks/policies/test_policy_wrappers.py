@@ -62,7 +62,7 @@ class Still(Policy[tuple[Tensor, int]]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> tuple[Tensor, int]:
         for plan in self.plans:
             plan.append(steps)
-        return torch.tensor([self.value, float(domain.begin[1])]), 0
+        return torch.tensor([self.value, float(domain.initial_point[1])]), 0
 
     def propose(self, state: tuple[Tensor, int], n: int) -> tuple[tuple[Proposal, ...], tuple[Tensor, int]]:
         u, done = state
