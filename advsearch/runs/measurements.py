@@ -83,7 +83,7 @@ class Measurements:
         self._store.set_note(key, json.dumps(value))
 
     def read(self, key: str) -> Any:
-        return self._store.noted(key)
+        return self._store.read_json_note(key)
 
     def collect(
         self, rows: Iterable[Row], make_result: Callable[[list[Row]], AnyResult]
