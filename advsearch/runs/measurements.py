@@ -80,7 +80,7 @@ class Measurements:
         ]
 
     def put(self, key: str, value: Any) -> None:
-        self._store.set_note(key, json.dumps(value))
+        self._store.write_note(key, json.dumps(value))
 
     def read(self, key: str) -> Any:
         return self._store.read_json_note(key)
