@@ -80,7 +80,7 @@ def basketball_seams(directions: Array) -> Array:
     """
     x, y, z = np.abs(directions).T
     curved_seam = np.abs(y - (0.42 + 0.38 * z**2))
-    return np.minimum(np.minimum(x, z), curved_seam)
+    return np.asarray(np.minimum(np.minimum(x, z), curved_seam))
 
 
 def tennis_seam(directions: Array) -> Array:
@@ -90,7 +90,7 @@ def tennis_seam(directions: Array) -> Array:
     distance.
     """
     x, y, z = directions.T
-    return np.abs(x**2 - y**2 - 0.75 * z * (1.2 - 0.2 * z**2)) * 0.5
+    return np.asarray(np.abs(x**2 - y**2 - 0.75 * z * (1.2 - 0.2 * z**2)) * 0.5)
 
 
 def _press_seams(
