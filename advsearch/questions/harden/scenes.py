@@ -115,7 +115,7 @@ class SceneJobs:
         for batch in executor.compute([job] for job in jobs):
             (job,) = batch.items
             (value,) = batch.require_value(f"harden, scene {job.keywords['number']}")
-            worker_counts: dict[str, int] = {}
+            worker_counts: dict[str, float | str] = {}
             if executor.stats is not None:
                 worker_counts = executor.stats.progress_counts
             self.progress.advance(1, **worker_counts)
