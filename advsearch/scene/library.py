@@ -278,7 +278,8 @@ class LightImage:
 def read_light(path: Path, label: str = "environment") -> LightImage:
     """Read an ``.hdr`` or ``.exr`` image of any shape.
 
-    Errors are those of `import_environment`.
+    Errors are those of `import_environment`; radiance that is not finite, or negative,
+    is one, of which the message names the first texel.
     """
     data = read_bytes(path, label, ENVIRONMENT_SUFFIXES)
     if path.suffix.lower() == ".hdr":

@@ -392,6 +392,7 @@ class MeshSurface:
         edges = np.sort(edges, axis=1)
         order = np.lexsort((edges[:, 1], edges[:, 0]))
         is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
+        # The edges are in three blocks, of one edge of each face.
         face = order % len(mesh.faces)
         self._neighbours = np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
 

@@ -117,9 +117,10 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
 
 
 def _parse_thing(part: str) -> RequestedThing:
-    """Read one thing.
+    """Read one thing of a setting, see `parse_things`.
 
-    Raises InputError, UnknownNameError: it is not as described above.
+    The name is that of the object unless it has one of its own. Raises InputError,
+    UnknownNameError: it is not as described there.
     """
     object_spec, separator, rest = part.rpartition("@")
     words = [word.strip() for word in rest.split(",")]

@@ -284,7 +284,11 @@ def _tint(
 
 
 def _is_usable(soup: Soup, uvs: Float64Array) -> bool:
-    """Return whether UVs (F, 3, 2) are in [0, 1], and neither squashed nor tiny."""
+    """Return whether UVs (F, 3, 2) are in [0, 1], and neither squashed nor tiny.
+
+    Of the surface's area at most the fraction `_MAX_SQUASHED` may have none in UV
+    space, and all faces cover at least `_MIN_UV_AREA` there.
+    """
     if (
         not np.isfinite(uvs).all()
         or uvs.min() < -_UV_TOLERANCE

@@ -560,7 +560,10 @@ def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]
 
 
 def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
-    """Return clauses about what of a surface is not as in the scene."""
+    """Return clauses about what of a surface is not as in the scene.
+
+    `linear` are the linear values of its base color, of any shape.
+    """
     notes = []
     types = {str(plugin["type"]) for plugin in iterate_plugins(surface)}
     if BASE_COLOR not in types:
