@@ -574,11 +574,11 @@ def _read_distortion(
         names: the coefficients in the order of the list.
         counts: the lengths that the list may have.
     """
-    listing = entries.get(*DISTORTION_KEYS)
-    if is_neutral(listing) and not isinstance(listing, Mapping):
+    distortion = entries.get(*DISTORTION_KEYS)
+    if is_neutral(distortion) and not isinstance(distortion, Mapping):
         coefficients = _read_coefficients(entries, names)
     else:
-        values = entries.parse_numbers("distortion_coefficients", listing, counts)
+        values = entries.parse_numbers("distortion_coefficients", distortion, counts)
         coefficients = dict(zip(names, values, strict=False))
     model = entries.get("distortionmodel")
     is_none = isinstance(model, str) and model.strip().lower() == "none"

@@ -143,37 +143,37 @@ def add_lamps(scene: SceneDescription) -> SceneDescription:
         InputError: the light of the environment has no unit, the object's size is not
             known, or a name is taken.
     """
-    others = tuple(
+    other_parts = tuple(
         part for part in scene.parts if not isinstance(part, (BeamLamp, LampGlass))
     )
     kind_by_carrier = {
         "object": get_lamp_kind(scene, "object.lamps"),
         CAMERA: get_lamp_kind(scene, "camera.lamps"),
     }
-    for part in others:
+    for part in other_parts:
         if isinstance(part, ThingPart):
             kind_by_carrier[part.name] = part.lamps
     kind_by_lit_carrier = {
         carrier: kind for carrier, kind in kind_by_carrier.items() if kind != LAMPS[0]
     }
     if not kind_by_lit_carrier:
-        if len(others) == len(scene.parts):
+        if len(other_parts) == len(scene.parts):
             return scene
-        return replace(scene, parts=others)
+        return replace(scene, parts=other_parts)
     unit = _check_units(scene, next(iter(kind_by_lit_carrier)))
-    scene = replace(scene, parts=others)
+    scene = replace(scene, parts=other_parts)
     # Two beams of each car; all of them are sampled as often as the environment.
     weight = 1.0 / (2 * len(kind_by_lit_carrier))
     lamps: list[ScenePart] = []
     for carrier, kind in kind_by_lit_carrier.items():
         lamps += _make_lamps(scene, carrier, kind, unit, weight)
-    duplicates = {part.name for part in others} & {lamp.name for lamp in lamps}
+    duplicates = {part.name for part in other_parts} & {lamp.name for lamp in lamps}
     if duplicates:
         raise InputError(
             "things: lamps of the scene are called "
             f"{', '.join(sorted(duplicates))}; give yours another name="
         )
-    return replace(scene, parts=(*others, *lamps))
+    return replace(scene, parts=(*other_parts, *lamps))
 
 
 def _check_units(scene: SceneDescription, carrier: str) -> float:

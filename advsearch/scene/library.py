@@ -334,15 +334,15 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
             gives the first position.
     """
     file = Path(path)
-    picture = read_light(file)
-    notes = [f"{file.name}: {note}" for note in picture.notes]
-    height, width = picture.size
+    light_image = read_light(file)
+    notes = [f"{file.name}: {note}" for note in light_image.notes]
+    height, width = light_image.size
     if abs(width / (2 * height) - 1.0) > 0.01:
         notes.append(
             f"{file.name}: expected a map twice as wide as high, got {width} "
             f"x {height}; it appears stretched"
         )
-    radiance = _resize_map(picture.read_rows, picture.size)
+    radiance = _resize_map(light_image.read_rows, light_image.size)
     if not radiance.any():
         notes.append(
             f"{file.name}: the environment is black everywhere; it lights nothing"

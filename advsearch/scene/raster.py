@@ -169,13 +169,13 @@ def _list_integers_within(
     Returns:
         The index of the interval, and the integer, interval by interval.
     """
-    first = np.maximum(np.ceil(lower - tolerance), 0.0).astype(np.int64)
-    last = np.minimum(np.floor(upper + tolerance), size - 1.0).astype(np.int64)
-    counts = np.maximum(last - first + 1, 0)
+    first_integer = np.maximum(np.ceil(lower - tolerance), 0.0).astype(np.int64)
+    last_integer = np.minimum(np.floor(upper + tolerance), size - 1.0).astype(np.int64)
+    counts = np.maximum(last_integer - first_integer + 1, 0)
     interval = np.repeat(np.arange(len(counts)), counts)
     start = np.cumsum(counts) - counts
-    value = first[interval] + np.arange(len(interval)) - start[interval]
-    return interval, value
+    integer = first_integer[interval] + np.arange(len(interval)) - start[interval]
+    return interval, integer
 
 
 def _cross_rows(

@@ -499,9 +499,7 @@ def _count_texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
     n_texels = 0.0
     uv_areas = np.nan_to_num(np.abs(compute_doubled_areas(soup.uvs)) / 2.0)
     for part, area in enumerate(np.bincount(soup.part, uv_areas)):
-        sizes = (
-            picture.shape[0] * picture.shape[1] for picture in surfaces[part].images
-        )
+        sizes = (image.shape[0] * image.shape[1] for image in surfaces[part].images)
         n_texels += float(area) * max(sizes, default=0)
     return n_texels
 

@@ -37,11 +37,11 @@ def _is_convex(corners: Float64Array) -> bool:
     """
     edges = np.roll(corners, -1, axis=0) - corners
     # cross products of successive edges
-    turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
+    cross_products = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
         edges[:, 0], -1
     )
-    smallest = float(turns.min())
-    largest = float(turns.max())
+    smallest = float(cross_products.min())
+    largest = float(cross_products.max())
     rounding = 1e-9 * max(-smallest, largest)
     return rounding > 0.0 and (smallest >= -rounding or largest <= rounding)
 
