@@ -221,11 +221,14 @@ def read_camera(spec: str) -> CameraModel:
 
 
 def _flatten_groups(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return entries with those of camodocal's groups on the top level."""
+    """Return entries with those of camodocal's groups on the top level.
+
+    The numbers of its fisheye lens get the names that other programs give them.
+    """
     groups = {
-        name: group
+        name: data[name]
         for name in CAMODOCAL_GROUPS
-        if isinstance(group := data.get(name), dict)
+        if isinstance(data.get(name), dict)
     }
     entries = {name: value for name, value in data.items() if name not in groups}
     for group in groups.values():

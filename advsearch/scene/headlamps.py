@@ -325,17 +325,19 @@ def _make_glass(
     corners = vertices[faces] / units_per_metre
     # square metres, as seen from where the lamps shine to
     facing_area = facing * compute_area_vectors(corners)[:, 0] / 2.0
-    geometry = (
-        vertices.astype(np.float32),
-        faces.astype(np.uint32),
-        normals.astype(np.float32),
-        mesh.uvs[carrier_vertex],
+    glass_mesh = Mesh(
+        vertices=vertices.astype(np.float32),
+        faces=faces.astype(np.uint32),
+        normals=normals.astype(np.float32),
+        uvs=mesh.uvs[carrier_vertex],
     )
+    # the color of the light, not quite as bright as a base color may be
+    glass_color = (0.8 * power / power.max()).astype(np.float32)
     radiance = 2.0 * power / max(float(facing_area.clip(0.0).sum()), 1e-9)
     return LampGlass(
         name=f"{part.name}-{lamp_type}",
-        mesh=Mesh(*geometry),
-        base_color=np.tile((0.8 * power / power.max()).astype(np.float32), (2, 2, 1)),
+        mesh=glass_mesh,
+        base_color=np.tile(glass_color, (2, 2, 1)),
         material=GLASS_MATERIAL,
         emission=radiance.astype(np.float32)[None, None],
         carrier=part.name,

@@ -386,7 +386,8 @@ def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
     for name in names:
         words = words_by_id[name]
         poses.append(_parse_image(f"{path}: image {name[:40]}", words))
-        models.append(read_camera(f"{cameras_path}#{words[8]}"))
+        camera_id = words[8]
+        models.append(read_camera(f"{cameras_path}#{camera_id}"))
     return _make_mounts(path, names, poses, models)
 
 
