@@ -780,14 +780,14 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     n_faces = torch.bincount(owner, minlength=len(ends))
     last_entry = n_faces.cumsum(dim=0) - 1
     length = (vertices[ends[:, 1]] - vertices[ends[:, 0]]).norm(dim=1)
-    is_kept = (n_faces <= 2) & (length > 0.0)
-    ends = ends[is_kept]
-    is_single = n_faces[is_kept] == 1
+    is_measured = (n_faces <= 2) & (length > 0.0)
+    ends = ends[is_measured]
+    is_single = n_faces[is_measured] == 1
     axis = _compute_edge_directions(vertices, ends)
 
     def along_face(entry: Tensor) -> Tensor:
         """Return unit vectors along one of an edge's faces, perpendicular to it."""
-        vector = vertices[across[order[entry[is_kept]]]] - vertices[ends[:, 0]]
+        vector = vertices[across[order[entry[is_measured]]]] - vertices[ends[:, 0]]
         return torch.nn.functional.normalize(
             vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1
         )
