@@ -344,7 +344,12 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
-    """Translate a camera of OpenSfM, whose lengths are fractions of the larger side."""
+    """Translate a camera of OpenSfM, whose lengths are fractions of the larger side.
+
+    The principal point counts from the middle of the image; here from the center of the
+    first pixel. `focal` is that of both axes unless they have their own. A camera of an
+    unknown kind, or a panorama, keeps only its kind and size.
+    """
     stated_type = str(camera["projection_type"])
     entries = {
         name: value

@@ -68,10 +68,10 @@ class Entries:
     def __init__(self, path: str, values: Mapping[str, Any]) -> None:
         self.path = path
         self._keys: TrackedKeys[Any] = TrackedKeys(values, fold=normalize_key)
-        for first in self._keys.repeated:
-            other = self._keys.get_spelling(normalize_key(first))
+        for key in self._keys.repeated:
+            later_key = self._keys.get_spelling(normalize_key(key))
             raise FileFormatError(
-                f"{path}: has {format_name(first)} and {format_name(other)}; leave one "
+                f"{path}: has {format_name(key)} and {format_name(later_key)}; leave one "
                 "of them out"
             )
         # Keys of matrices that are not read.

@@ -221,11 +221,14 @@ def read_camera(spec: str) -> CameraModel:
 
 
 def _flatten_groups(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return entries with those of camodocal's groups on the top level."""
+    """Return entries with those of camodocal's groups on the top level.
+
+    The numbers of its fisheye lens get the names that other programs give them.
+    """
     groups = {
-        name: group
+        name: data[name]
         for name in CAMODOCAL_GROUPS
-        if isinstance(group := data.get(name), dict)
+        if isinstance(data.get(name), dict)
     }
     entries = {name: value for name, value in data.items() if name not in groups}
     for group in groups.values():
@@ -574,11 +577,11 @@ def _read_distortion(
         names: the coefficients in the order of the list.
         counts: the lengths that the list may have.
     """
-    listing = entries.get(*DISTORTION_KEYS)
-    if is_neutral(listing) and not isinstance(listing, Mapping):
+    distortion = entries.get(*DISTORTION_KEYS)
+    if is_neutral(distortion) and not isinstance(distortion, Mapping):
         coefficients = _read_coefficients(entries, names)
     else:
-        values = entries.parse_numbers("distortion_coefficients", listing, counts)
+        values = entries.parse_numbers("distortion_coefficients", distortion, counts)
         coefficients = dict(zip(names, values, strict=False))
     model = entries.get("distortionmodel")
     is_none = isinstance(model, str) and model.strip().lower() == "none"

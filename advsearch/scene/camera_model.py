@@ -471,8 +471,13 @@ def make_pinhole(fov: float, aspect: float) -> CameraModel:
         aspect: width divided by height.
     """
     focal = 0.5 / math.tan(math.radians(fov) / 2.0)
-    linear = (focal * max(1.0, 1.0 / aspect), focal * max(1.0, aspect), 0.5, 0.5, 0.0)
-    return CameraModel(BROWN_CONRADY, (*linear, *[0.0] * len(COEFFICIENTS)))
+    # Lengths along x are in image widths, those along y in image heights.
+    fx = focal * max(1.0, 1.0 / aspect)
+    fy = focal * max(1.0, aspect)
+    cx = cy = 0.5
+    skew = 0.0
+    no_distortion = [0.0] * len(COEFFICIENTS)
+    return CameraModel(BROWN_CONRADY, (fx, fy, cx, cy, skew, *no_distortion))
 
 
 def make_bundled_models(aspect: float = 1.0) -> Mapping[str, CameraModel]:

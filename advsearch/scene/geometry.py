@@ -536,8 +536,8 @@ def compute_footprint(points: Float64Array) -> Footprint:
 
 def is_overlapping(first: Footprint, second: Footprint) -> bool:
     """Return whether two footprints overlap from above, at heights that both have."""
-    begin, end = find_overlap_interval(first, second, np.array([1.0, 0.0]))
-    return begin < 0.0 < end
+    start, end = find_overlap_interval(first, second, np.array([1.0, 0.0]))
+    return start < 0.0 < end
 
 
 def find_overlap_interval(
@@ -581,6 +581,6 @@ def find_overlap_interval(
     if (is_parallel & ((separations[0] >= 0.0) | (separations[1] <= 0.0))).any():
         return math.inf, -math.inf
     intervals = np.sort(separations[:, ~is_parallel] / speed[~is_parallel], axis=0)
-    begin = float(intervals[0].max())
+    start = float(intervals[0].max())
     end = float(intervals[1].min())
-    return (begin, end) if begin < end else (math.inf, -math.inf)
+    return (start, end) if start < end else (math.inf, -math.inf)

@@ -337,17 +337,17 @@ def _to_bytes(color: Float32Array) -> ByteImage:
 
 def _encode_png_with_alpha(color: ByteImage, opacity: ByteImage) -> bytes:
     """Encode colors (H, W, 3) with an opacity, resized to their size, as PNG."""
-    picture = Image.fromarray(color)
-    picture.putalpha(
-        Image.fromarray(opacity).resize(picture.size, Image.Resampling.BILINEAR)
+    image = Image.fromarray(color)
+    image.putalpha(
+        Image.fromarray(opacity).resize(image.size, Image.Resampling.BILINEAR)
     )
-    return encode_levels(np.asarray(picture))
+    return encode_levels(np.asarray(image))
 
 
 def _encode_jpeg(color: ByteImage) -> bytes:
     """Encode colors (H, W, 3) as JPEG, reduced to the size for the web."""
     file = io.BytesIO()
-    picture = Image.fromarray(color)
-    picture.thumbnail((WEB_TEXTURE_SIZE, WEB_TEXTURE_SIZE))
-    picture.save(file, "JPEG", quality=WEB_QUALITY, subsampling=0)
+    image = Image.fromarray(color)
+    image.thumbnail((WEB_TEXTURE_SIZE, WEB_TEXTURE_SIZE))
+    image.save(file, "JPEG", quality=WEB_QUALITY, subsampling=0)
     return file.getvalue()

@@ -372,6 +372,7 @@ def forbid_second_derivatives(backward: Backward) -> Backward:
 
     @wraps(backward)
     def once(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        """Return the derivatives, guarded if another backward pass may follow."""
         with torch.no_grad():
             derivatives = backward(ctx, cotangent)
         if not torch.is_grad_enabled():

@@ -139,9 +139,9 @@ def _make_ring_faces() -> npt.NDArray[np.uint32]:
     ring_starts = np.arange(N_RINGS)[:, None] * (N_SECTORS + 1)
     inner = (ring_starts + np.arange(N_SECTORS)).ravel()
     outer = inner + N_SECTORS + 1
-    first = np.stack([outer, inner, outer + 1], axis=1)
-    second = np.stack([inner, inner + 1, outer + 1], axis=1)[N_SECTORS:]
-    return np.concatenate([first, second]).astype(np.uint32)
+    outer_triangles = np.stack([outer, inner, outer + 1], axis=1)
+    inner_triangles = np.stack([inner, inner + 1, outer + 1], axis=1)[N_SECTORS:]
+    return np.concatenate([outer_triangles, inner_triangles]).astype(np.uint32)
 
 
 @lru_cache(maxsize=4)
@@ -192,24 +192,28 @@ def is_against_traffic(scene: SceneDescription, camera: Float64Array) -> bool:
     """
     if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
         return False
-    ahead, aside = (camera[:2, 3] - compute_center(scene)[:2]) * scene.metres
+    distance_ahead, distance_aside = (
+        camera[:2, 3] - compute_center(scene)[:2]
+    ) * scene.metres
     height = float(camera[2, 3]) * scene.metres
     place = find_place(scene)
     width = LANE_WIDTH
     if place is not None and place.file.lane_width is not None:
         width = place.file.lane_width
     return bool(
-        ahead > 0.0 and abs(aside) <= width / 2.0 and height <= MAX_CAR_CAMERA_HEIGHT
+        distance_ahead > 0.0
+        and abs(distance_aside) <= width / 2.0
+        and height <= MAX_CAR_CAMERA_HEIGHT
     )
 
 
 def make_traffic_remark(scene: SceneDescription) -> str:
     """Return the remark on a camera that drives against the traffic."""
-    behind = (180.0 - scene.azimuth_zero) % 360.0
+    azimuth_behind = (180.0 - scene.azimuth_zero) % 360.0
     return (
         f"The camera is in the lane of {scene.object.name} and looks at its front, "
         "against the traffic; behind it is "
-        f"`set` camera.azimuth={behind:g}"
+        f"`set` camera.azimuth={azimuth_behind:g}"
     )
 
 

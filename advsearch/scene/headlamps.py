@@ -143,37 +143,37 @@ def add_lamps(scene: SceneDescription) -> SceneDescription:
         InputError: the light of the environment has no unit, the object's size is not
             known, or a name is taken.
     """
-    others = tuple(
+    other_parts = tuple(
         part for part in scene.parts if not isinstance(part, (BeamLamp, LampGlass))
     )
     kind_by_carrier = {
         "object": get_lamp_kind(scene, "object.lamps"),
         CAMERA: get_lamp_kind(scene, "camera.lamps"),
     }
-    for part in others:
+    for part in other_parts:
         if isinstance(part, ThingPart):
             kind_by_carrier[part.name] = part.lamps
     kind_by_lit_carrier = {
         carrier: kind for carrier, kind in kind_by_carrier.items() if kind != LAMPS[0]
     }
     if not kind_by_lit_carrier:
-        if len(others) == len(scene.parts):
+        if len(other_parts) == len(scene.parts):
             return scene
-        return replace(scene, parts=others)
+        return replace(scene, parts=other_parts)
     unit = _check_units(scene, next(iter(kind_by_lit_carrier)))
-    scene = replace(scene, parts=others)
+    scene = replace(scene, parts=other_parts)
     # Two beams of each car; all of them are sampled as often as the environment.
     weight = 1.0 / (2 * len(kind_by_lit_carrier))
     lamps: list[ScenePart] = []
     for carrier, kind in kind_by_lit_carrier.items():
         lamps += _make_lamps(scene, carrier, kind, unit, weight)
-    duplicates = {part.name for part in others} & {lamp.name for lamp in lamps}
+    duplicates = {part.name for part in other_parts} & {lamp.name for lamp in lamps}
     if duplicates:
         raise InputError(
             "things: lamps of the scene are called "
             f"{', '.join(sorted(duplicates))}; give yours another name="
         )
-    return replace(scene, parts=(*others, *lamps))
+    return replace(scene, parts=(*other_parts, *lamps))
 
 
 def _check_units(scene: SceneDescription, carrier: str) -> float:
@@ -325,17 +325,19 @@ def _make_glass(
     corners = vertices[faces] / units_per_metre
     # square metres, as seen from where the lamps shine to
     facing_area = facing * compute_area_vectors(corners)[:, 0] / 2.0
-    geometry = (
-        vertices.astype(np.float32),
-        faces.astype(np.uint32),
-        normals.astype(np.float32),
-        mesh.uvs[carrier_vertex],
+    glass_mesh = Mesh(
+        vertices=vertices.astype(np.float32),
+        faces=faces.astype(np.uint32),
+        normals=normals.astype(np.float32),
+        uvs=mesh.uvs[carrier_vertex],
     )
+    # the color of the light, not quite as bright as a base color may be
+    glass_color = (0.8 * power / power.max()).astype(np.float32)
     radiance = 2.0 * power / max(float(facing_area.clip(0.0).sum()), 1e-9)
     return LampGlass(
         name=f"{part.name}-{lamp_type}",
-        mesh=Mesh(*geometry),
-        base_color=np.tile((0.8 * power / power.max()).astype(np.float32), (2, 2, 1)),
+        mesh=glass_mesh,
+        base_color=np.tile(glass_color, (2, 2, 1)),
         material=GLASS_MATERIAL,
         emission=radiance.astype(np.float32)[None, None],
         carrier=part.name,

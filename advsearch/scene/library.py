@@ -278,7 +278,8 @@ class LightImage:
 def read_light(path: Path, label: str = "environment") -> LightImage:
     """Read an ``.hdr`` or ``.exr`` image of any shape.
 
-    Errors are those of `import_environment`.
+    Errors are those of `import_environment`; radiance that is not finite, or negative,
+    is one, of which the message names the first texel.
     """
     data = read_bytes(path, label, ENVIRONMENT_SUFFIXES)
     if path.suffix.lower() == ".hdr":
@@ -333,15 +334,15 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
             gives the first position.
     """
     file = Path(path)
-    picture = read_light(file)
-    notes = [f"{file.name}: {note}" for note in picture.notes]
-    height, width = picture.size
+    light_image = read_light(file)
+    notes = [f"{file.name}: {note}" for note in light_image.notes]
+    height, width = light_image.size
     if abs(width / (2 * height) - 1.0) > 0.01:
         notes.append(
             f"{file.name}: expected a map twice as wide as high, got {width} "
             f"x {height}; it appears stretched"
         )
-    radiance = _resize_map(picture.read_rows, picture.size)
+    radiance = _resize_map(light_image.read_rows, light_image.size)
     if not radiance.any():
         notes.append(
             f"{file.name}: the environment is black everywhere; it lights nothing"

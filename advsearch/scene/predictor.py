@@ -128,6 +128,7 @@ class LinearMap(torch.autograd.Function):
         transposed_times: Callable[[Tensor], Tensor],
         values: Tensor,
     ) -> Tensor:
+        """Return the map's `values`, and store its transpose for the derivative."""
         ctx.transpose = transposed_times, times
         return times(values.detach())
 

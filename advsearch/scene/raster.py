@@ -54,6 +54,7 @@ def rasterize_triangles(
         For each pixel of each triangle, triangle by triangle, the triangle, row and
         column (N,), and the corners' barycentric weights (N, 3).
     """
+    # Wide: which of the candidates lie in a triangle is decided by their weights.
     face, row, column = find_candidate_pixels(corners, shape, 10.0 * PIXEL_TOLERANCE)
     weights = compute_barycentric(corners[face], row, column)
     inside = (weights >= -tolerance).all(axis=1)
@@ -169,13 +170,13 @@ def _list_integers_within(
     Returns:
         The index of the interval, and the integer, interval by interval.
     """
-    first = np.maximum(np.ceil(lower - tolerance), 0.0).astype(np.int64)
-    last = np.minimum(np.floor(upper + tolerance), size - 1.0).astype(np.int64)
-    counts = np.maximum(last - first + 1, 0)
+    first_integer = np.maximum(np.ceil(lower - tolerance), 0.0).astype(np.int64)
+    last_integer = np.minimum(np.floor(upper + tolerance), size - 1.0).astype(np.int64)
+    counts = np.maximum(last_integer - first_integer + 1, 0)
     interval = np.repeat(np.arange(len(counts)), counts)
     start = np.cumsum(counts) - counts
-    value = first[interval] + np.arange(len(interval)) - start[interval]
-    return interval, value
+    integer = first_integer[interval] + np.arange(len(interval)) - start[interval]
+    return interval, integer
 
 
 def _cross_rows(
@@ -392,6 +393,7 @@ class MeshSurface:
         edges = np.sort(edges, axis=1)
         order = np.lexsort((edges[:, 1], edges[:, 0]))
         is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
+        # The edges are in three blocks, of one edge of each face.
         face = order % len(mesh.faces)
         self._neighbours = np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
 

@@ -122,12 +122,12 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
         FileFormatError: there are more than `MAX_CAMERAS`, numbers that no camera has,
             or models of different kinds.
     """
-    path, _, which = spec.partition("#")
+    path, _, camera_names = spec.partition("#")
     if Path(path).name == COLMAP_IMAGES:
-        return _read_colmap(path, which)
-    if Path(path).suffix.lower() == ".json" and "," in which:
-        return _read_transforms(path, which)
-    if which or Path(spec).suffix.lower() not in (".yaml", ".yml"):
+        return _read_colmap(path, camera_names)
+    if Path(path).suffix.lower() == ".json" and "," in camera_names:
+        return _read_transforms(path, camera_names)
+    if camera_names or Path(spec).suffix.lower() not in (".yaml", ".yml"):
         return ()
     try:
         data = parse_yaml(read_text(Path(spec), "a camera file", MAX_YAML_BYTES))
@@ -162,9 +162,9 @@ def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
         )
     if len({mount.name for mount in mounts}) < len(mounts):
         raise FileFormatError(f"{spec}: expected a name of its own for each camera")
-    first = mounts[0]
-    is_moved = not np.allclose(first.pose, np.eye(4))
-    if is_moved or first.azimuth or first.delay:
+    first_mount = mounts[0]
+    is_moved = not np.allclose(first_mount.pose, np.eye(4))
+    if is_moved or first_mount.azimuth or first_mount.delay:
         raise FileFormatError(
             f"{spec}: the first camera is the scene's own; it takes "
             "no place, turn, around or later"
@@ -386,7 +386,8 @@ def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
     for name in names:
         words = words_by_id[name]
         poses.append(_parse_image(f"{path}: image {name[:40]}", words))
-        models.append(read_camera(f"{cameras_path}#{words[8]}"))
+        camera_id = words[8]
+        models.append(read_camera(f"{cameras_path}#{camera_id}"))
     return _make_mounts(path, names, poses, models)
 
 

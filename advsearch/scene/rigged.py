@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -93,6 +94,17 @@ def _compose_matrices(translation: Tensor, rotation: Tensor, scale: Tensor) -> T
     return torch.cat([upper_rows, last_row], dim=1)
 
 
+class _MeshTarget(NamedTuple):
+    """A morph target of one node, for those vertices of the mesh that it moves."""
+
+    name: str
+    node: int
+    index: int  # among the targets of the node
+    rest_weight: float
+    rows: Tensor  # (K,) of the mesh's vertices
+    offsets: Tensor  # (K, 3) at weight 1
+
+
 class SkeletonRig:
     """Moves the mesh of a glTF file.
 
@@ -142,8 +154,7 @@ class SkeletonRig:
         self._inverse_binds = torch.from_numpy(
             np.concatenate([part.inverse_binds for part in parts])
         )
-        # Name, node, index, weight at rest, vertices and offsets of each morph target.
-        self._targets: list[tuple[str, int, int, float, Tensor, Tensor]] = []
+        self._targets: list[_MeshTarget] = []
         self._add_targets(parts, vertices)
         self._nodes_by_depth = _group_by_depth(self.skeleton.parents)
         self._node_order = torch.argsort(
@@ -174,13 +185,13 @@ class SkeletonRig:
                 target_rows = row_of_vertex[vertices[mesh_rows] - start]
                 is_moved = target_rows >= 0
                 self._targets.append(
-                    (
-                        target.name,
-                        part.node,
-                        index,
-                        float(part.rest_weights[index]),
-                        torch.from_numpy(mesh_rows[is_moved]),
-                        torch.from_numpy(target.offsets[target_rows[is_moved]]),
+                    _MeshTarget(
+                        name=target.name,
+                        node=part.node,
+                        index=index,
+                        rest_weight=float(part.rest_weights[index]),
+                        rows=torch.from_numpy(mesh_rows[is_moved]),
+                        offsets=torch.from_numpy(target.offsets[target_rows[is_moved]]),
                     )
                 )
 
@@ -202,19 +213,19 @@ class SkeletonRig:
     @property
     def targets(self) -> tuple[str, ...]:
         """Names of the morph targets, each once."""
-        return tuple(dict.fromkeys(name for name, *_ in self._targets))
+        return tuple(dict.fromkeys(target.name for target in self._targets))
 
     @property
     def defaults(self) -> Mapping[str, float]:
         """Values of all parameters at rest, by name."""
         time = {TIME.name: 0.0} if self.clips else {}
-        turns = {f"{name}.{axis}": 0.0 for name in self.joints for axis in AXES}
+        angles = {f"{name}.{axis}": 0.0 for name in self.joints for axis in AXES}
         # Of targets with the same name, the first counts.
         weights = {
-            f"{name}.{WEIGHT}": rest
-            for name, _, _, rest, _, _ in reversed(self._targets)
+            f"{target.name}.{WEIGHT}": target.rest_weight
+            for target in reversed(self._targets)
         }
-        return time | turns | weights
+        return time | angles | weights
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -302,21 +313,21 @@ class SkeletonRig:
         """Return the vertices (V, 3) of the meshes with morph targets applied.
 
         Args:
-            number: values of parameters, which override those of a clip.
+            number_by_name: values of parameters, which override those of a clip.
             clip_weights: weights of a clip, by node.
             device: of the result.
         """
         points = self._points.to(device)
-        for name, node, index, rest, rows, moves in self._targets:
-            weight = number_by_name.get(f"{name}.{WEIGHT}")
-            if weight is None and node in clip_weights:
-                weight = clip_weights[node][index]
+        for target in self._targets:
+            weight = number_by_name.get(f"{target.name}.{WEIGHT}")
+            if weight is None and target.node in clip_weights:
+                weight = clip_weights[target.node][target.index]
             elif weight is None:
-                weight = torch.tensor(rest, dtype=torch.float64)
+                weight = torch.tensor(target.rest_weight, dtype=torch.float64)
+            # A weight of 0 is left out, unless its derivative is wanted.
             if weight.requires_grad or float(weight) != 0.0:
-                points = points.index_add(
-                    0, rows.to(device), weight.to(device) * moves.to(device)
-                )
+                offsets = weight.to(device) * target.offsets.to(device)
+                points = points.index_add(0, target.rows.to(device), offsets)
         return points
 
     def _find_clip_time(

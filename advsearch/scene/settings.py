@@ -568,9 +568,9 @@ def find_parameter(name: str) -> Parameter | None:
 
     Also for settings of a mesh around the object.
     """
-    family, _, rest = name.partition(":")
-    if rest and family in MESH_FAMILIES:
-        name = f"{family}.{rest.rpartition('.')[2]}"
+    family, _, full_name = name.partition(":")
+    if full_name and family in MESH_FAMILIES:
+        name = f"{family}.{full_name.rpartition('.')[2]}"
     return SETTINGS.get(name)
 
 

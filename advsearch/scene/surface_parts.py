@@ -86,6 +86,7 @@ def _make_grid_uvs(count: int) -> Float64Array:
     face = np.arange(count)
     cell = face // 2
     cell_corner = np.stack([cell % n_columns, cell // n_columns], axis=1)[:, None, :]
+    # A margin in each cell, and a gap between its two halves, keep faces apart.
     lower_half = np.array([[0.05, 0.05], [0.85, 0.05], [0.05, 0.85]])
     is_lower = (face % 2 == 0)[:, None, None]
     in_cell = np.where(is_lower, lower_half, 1.0 - lower_half)

@@ -117,9 +117,10 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
 
 
 def _parse_thing(part: str) -> RequestedThing:
-    """Read one thing.
+    """Read one thing of a setting, see `parse_things`.
 
-    Raises InputError, UnknownNameError: it is not as described above.
+    The name is that of the object unless it has one of its own. Raises InputError,
+    UnknownNameError: it is not as described there.
     """
     object_spec, separator, rest = part.rpartition("@")
     words = [word.strip() for word in rest.split(",")]
@@ -247,10 +248,10 @@ def add_things(
         if isinstance(part, ThingPart)
     }
     remarks += [
-        f"{first[0].upper()}{first[1:]} and {other} stand in each other: their "
+        f"{first_name[0].upper()}{first_name[1:]} and {second_name} stand in each other: their "
         "outlines on the ground overlap."
-        for first, other in combinations(footprints, 2)
-        if is_overlapping(footprints[first], footprints[other])
+        for first_name, second_name in combinations(footprints, 2)
+        if is_overlapping(footprints[first_name], footprints[second_name])
     ]
     return replace(scene, remarks=(*scene.remarks, *remarks))
 
@@ -307,9 +308,9 @@ def find_triangle_heights(corners: Float64Array, position: Float64Array) -> list
     """
     a, b, c = np.moveaxis(corners, 1, 0)
     doubled_areas = [
-        (end[:, 0] - begin[:, 0]) * (position[1] - begin[:, 1])
-        - (end[:, 1] - begin[:, 1]) * (position[0] - begin[:, 0])
-        for begin, end in ((b, c), (c, a), (a, b))
+        (end[:, 0] - start[:, 0]) * (position[1] - start[:, 1])
+        - (end[:, 1] - start[:, 1]) * (position[0] - start[:, 0])
+        for start, end in ((b, c), (c, a), (a, b))
     ]
     total_area = doubled_areas[0] + doubled_areas[1] + doubled_areas[2]
     barycentric = np.stack(doubled_areas) / np.where(

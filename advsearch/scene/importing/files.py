@@ -197,7 +197,11 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
 
 
 def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
-    """Raise FileFormatError for a directory, or a file with another suffix."""
+    """Raise FileFormatError for a directory, or a file with another suffix.
+
+    The message has advice: to leave out a `#part` that the kind of file cannot have, or
+    how to convert the file.
+    """
     if path.is_dir():
         raise FileFormatError(
             f"{path}: expected a file with an {what}, got a "

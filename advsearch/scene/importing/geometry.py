@@ -161,11 +161,11 @@ def _check_finite(vertices: Float64Array, source: str) -> None:
     """Raise InputError if vertices (V, 3) are NaN or infinite."""
     is_bad = ~np.isfinite(vertices).all(axis=1)
     if is_bad.any():
-        first = int(is_bad.argmax())
+        first_bad = int(is_bad.argmax())
         raise InputError(
             f"{source}: expected finite vertices, got {int(is_bad.sum())} of "
             f"{len(vertices)} with NaN or infinite"
-            f" coordinates (the first: {vertices[first].tolist()}); repair the mesh or "
+            f" coordinates (the first: {vertices[first_bad].tolist()}); repair the mesh or "
             "export it again"
         )
 

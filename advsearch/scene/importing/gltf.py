@@ -560,14 +560,14 @@ class GltfFile:
         """
         data = self.get_view(view)
         row_size = shape[1] * kind.itemsize
-        step = stride or row_size
-        end = offset + (shape[0] - 1) * step + row_size
+        row_stride = stride or row_size
+        end = offset + (shape[0] - 1) * row_stride + row_size
         if end > len(data):
             raise damaged(
                 self.path, f"a view of at least {end:,} bytes", f"{len(data):,}"
             )
         values: npt.NDArray[Any] = np.ndarray(
-            shape, kind, data, offset, (step, kind.itemsize)
+            shape, kind, data, offset, (row_stride, kind.itemsize)
         )
         return values
 

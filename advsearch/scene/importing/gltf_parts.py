@@ -259,11 +259,16 @@ def _count_phrases(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
     phrases = []
     for phrase, is_of_kind in kinds.items():
         count = sum(is_of_kind)
-        if count == 1:
-            phrases.append(f"{count} {phrase.format(s='', es='')}")
-        elif count:
-            phrases.append(f"{count} {phrase.format(s='s', es='es')}")
+        if count:
+            phrases.append(_format_count(count, phrase))
     return phrases
+
+
+def _format_count(count: int, phrase: str) -> str:
+    """Return a count and a phrase, whose {s} and {es} are endings of the plural."""
+    if count == 1:
+        return f"{count} {phrase.format(s='', es='')}"
+    return f"{count} {phrase.format(s='s', es='es')}"
 
 
 # How far texture coordinates may lie outside [0, 1] before the wrap mode matters.
@@ -799,7 +804,12 @@ def _note_pieces(
     with_faces: Mapping[tuple[int, int], PrimitiveData],
     notes: Notes,
 ) -> None:
-    """Note primitives without faces or material, and with transparent vertices."""
+    """Note primitives without faces or material, and with transparent vertices.
+
+    `keys` are all primitives: indices of the mesh, and of the primitive in it. Those of
+    them with faces are in `with_faces`. The faceless ones of Gaussian splats are noted
+    elsewhere.
+    """
     primitives = [header.meshes[mesh].primitives[index] for mesh, index in keys]
     n_splats = sum(
         any(map(is_splat_name, find_unread_extensions(primitive)))
@@ -816,12 +826,10 @@ def _note_pieces(
     meshes_without_material = {
         mesh for (mesh, _), piece in with_faces.items() if piece.material is None
     }
-    kinds = {
-        TRANSPARENT_COLORS_NOTE: [True] * len(transparent_meshes),
-        DEFAULT_MATERIAL_NOTE: [True] * len(meshes_without_material),
-    }
-    for sentence in _count_phrases(kinds):
-        notes.warn(sentence)
+    if transparent_meshes:
+        notes.warn(_format_count(len(transparent_meshes), TRANSPARENT_COLORS_NOTE))
+    if meshes_without_material:
+        notes.warn(_format_count(len(meshes_without_material), DEFAULT_MATERIAL_NOTE))
 
 
 def _make_parts(

@@ -247,7 +247,10 @@ def _read_offsets(
     name: str,
     used: IntArray,
 ) -> Float64Array | None:
-    """Return what a morph target adds to an attribute of used vertices, (V, 3)."""
+    """Return what a morph target adds to an attribute of used vertices, (V, 3).
+
+    None if the target leaves the attribute as it is.
+    """
     if name not in attributes:
         return None
     accessors = file.header.accessors

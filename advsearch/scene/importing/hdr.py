@@ -136,10 +136,10 @@ def _read_layer(
     """Return the header, the planes and the notes of the layer that is the image."""
     with OpenEXR.File(
         io.BytesIO(data), separate_channels=True, header_only=True
-    ) as picture:
-        _check_size(file, picture)
-    with OpenEXR.File(io.BytesIO(data), separate_channels=True) as picture:
-        parts = [(dict(part.header), dict(part.channels)) for part in picture.parts]
+    ) as exr_file:
+        _check_size(file, exr_file)
+    with OpenEXR.File(io.BytesIO(data), separate_channels=True) as exr_file:
+        parts = [(dict(part.header), dict(part.channels)) for part in exr_file.parts]
         is_incomplete = any(
             len(channels) != len(header["channels"]) for header, channels in parts
         )
@@ -320,8 +320,8 @@ def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
     """
     for axis in (0, 1):
         last_index = plane.shape[axis] - 1
-        step = round(size[axis] / (last_index + 1))
-        position = np.minimum(np.arange(size[axis]) / step, last_index)
+        spacing = round(size[axis] / (last_index + 1))
+        position = np.minimum(np.arange(size[axis]) / spacing, last_index)
         lower = position.astype(np.int64)
         upper = np.minimum(lower + 1, last_index)
         fraction = np.expand_dims((position - lower).astype(np.float32), 1 - axis)

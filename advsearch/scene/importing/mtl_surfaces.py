@@ -205,7 +205,9 @@ class MtlReader:
             name: the name by which the mesh file uses it.
         """
         # Statements are noted once, not for each square.
-        is_first = not any(known == id(material) for known, _ in self._surfaces)
+        is_first = not any(
+            material_id == id(material) for material_id, _ in self._surfaces
+        )
         uses = self._parse_uses(material, square)
         first_use = next((uses[key] for key in UV_MAPS if key in uses), MapUse("", {}))
         self._drop_other_layouts(material, uses, first_use)
@@ -573,19 +575,19 @@ def find_libraries(arguments: Sequence[str], references: References) -> list[str
         references: finds files beside the mesh file.
     """
     names: list[str] = []
-    for rest in arguments:
-        plain = without_comment(rest)
-        if _exists(references, rest):
-            names.append(rest)
-        elif _exists(references, plain):
-            names.append(plain)
+    for argument in arguments:
+        argument_without_comment = without_comment(argument)
+        if _exists(references, argument):
+            names.append(argument)
+        elif _exists(references, argument_without_comment):
+            names.append(argument_without_comment)
         else:
-            candidates = _split_libraries(plain)
+            candidates = _split_libraries(argument_without_comment)
             have_suffix = all(map(_has_mtl_suffix, candidates))
             if have_suffix or any(_exists(references, name) for name in candidates):
                 names += candidates
             else:
-                names.append(plain)
+                names.append(argument_without_comment)
     return list(dict.fromkeys(filter(None, names)))
 
 
@@ -711,7 +713,10 @@ class MtlMaterial:
     def keys(self) -> TrackedKeys[str]:
         """The statements, tracking which of them are read."""
         return TrackedKeys(
-            {self.spelling[key]: rest for key, rest in self.statements.items()},
+            {
+                self.spelling[key]: statement
+                for key, statement in self.statements.items()
+            },
             fold=str.lower,
         )
 

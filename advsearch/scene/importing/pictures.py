@@ -166,12 +166,15 @@ def _average(
     rows, columns, channels = image.shape
     height = row_weights.shape[0]
     width = column_weights.shape[0]
+    # The sparse product is of two matrices: all but one axis are one. (H, C * K)
     by_rows = row_weights @ image.reshape(rows, columns * channels)
+    # (C, H * K)
     transposed = (
         by_rows.reshape(height, columns, channels)
         .transpose(1, 0, 2)
         .reshape(columns, height * channels)
     )
+    # (H, W, K)
     averaged = (
         (column_weights @ transposed)
         .reshape(width, height, channels)

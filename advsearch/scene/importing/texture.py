@@ -284,7 +284,11 @@ def _tint(
 
 
 def _is_usable(soup: Soup, uvs: Float64Array) -> bool:
-    """Return whether UVs (F, 3, 2) are in [0, 1], and neither squashed nor tiny."""
+    """Return whether UVs (F, 3, 2) are in [0, 1], and neither squashed nor tiny.
+
+    Of the surface's area at most the fraction `_MAX_SQUASHED` may have none in UV
+    space, and all faces cover at least `_MIN_UV_AREA` there.
+    """
     if (
         not np.isfinite(uvs).all()
         or uvs.min() < -_UV_TOLERANCE
@@ -495,9 +499,7 @@ def _count_texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
     n_texels = 0.0
     uv_areas = np.nan_to_num(np.abs(compute_doubled_areas(soup.uvs)) / 2.0)
     for part, area in enumerate(np.bincount(soup.part, uv_areas)):
-        sizes = (
-            picture.shape[0] * picture.shape[1] for picture in surfaces[part].images
-        )
+        sizes = (image.shape[0] * image.shape[1] for image in surfaces[part].images)
         n_texels += float(area) * max(sizes, default=0)
     return n_texels
 

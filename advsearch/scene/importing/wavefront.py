@@ -341,16 +341,16 @@ def _parse_statements(
     smoothing_changes = list[tuple[int, str]]()
     for row, keyword, rest in lines.iterate_others():
         key = keyword.lower()
-        argument = without_comment(rest).lower()
+        clean_argument = without_comment(rest).lower()
         if key == "mtllib":
             library_lines.append(rest)
         elif key == "usemtl":
             material_changes.append((row, " ".join(rest.split())))
         elif key == "s":
-            smoothing_changes.append((row, argument))
+            smoothing_changes.append((row, clean_argument))
         elif key in NON_FACE_STATEMENTS:
             notes.record(f"{NON_FACE_STATEMENTS[key]}, statement", key)
-        elif key not in GROUPING and argument not in ("off", "0"):
+        elif key not in GROUPING and clean_argument not in ("off", "0"):
             notes.record("statement", keyword)
     return library_lines, material_changes, smoothing_changes
 
@@ -702,10 +702,10 @@ def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntAr
             not the first and its predecessor.
     """
     # Slashes between a number and its predecessor in the same corner.
-    step = np.where(is_first, 0, np.where(is_after_two_slashes, 2, 1))
-    column = step.copy()
-    column[1:] += np.where(is_first[1:], 0, step[:-1])
-    column[2:] += np.where(is_first[2:] | is_first[1:-1], 0, step[:-2])
+    n_slashes = np.where(is_first, 0, np.where(is_after_two_slashes, 2, 1))
+    column = n_slashes.copy()
+    column[1:] += np.where(is_first[1:], 0, n_slashes[:-1])
+    column[2:] += np.where(is_first[2:] | is_first[1:-1], 0, n_slashes[:-2])
     return np.asarray(column)
 
 

@@ -272,13 +272,13 @@ def select_newest(candidates: list[LibraryFile]) -> LibraryFile:
             rejected.append(f"{candidate.path} (cannot be loaded: {error})")
         else:
             return candidate
-    found = "Found: " + "; ".join(rejected) + "." if rejected else "Found none."
+    rejected_text = "Found: " + "; ".join(rejected) + "." if rejected else "Found none."
     command = get_install_command()
     separator = "\n" if "\n" in command else " "
     raise EnvironmentSetupError(
         f"expected a libLLVM of version {MIN_VERSION} or later, with which Dr.Jit "
         "compiles "
-        f"its kernels. {found} "
+        f"its kernels. {rejected_text} "
         f"Install one with:{separator}{command}{separator}or name a file in "
         f"{ENVIRONMENT_VARIABLE}."
     )

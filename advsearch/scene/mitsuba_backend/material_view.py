@@ -724,13 +724,13 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
         return None
     edge_index, _ = _sample_along(measure, random[:, 0])
     axis = edges.axis[edge_index]
-    first = edges.first[edge_index]
-    second = edges.second[edge_index]
+    along_first = edges.along_first[edge_index]
+    along_second = edges.along_second[edge_index]
 
     # A direction perpendicular to the edge, within the exterior angle.
     angle = random[:, 2:3] * edges.angle[edge_index][:, None]
     perpendicular = (
-        torch.cos(angle) * second + torch.sin(angle) * edges.turned[edge_index]
+        torch.cos(angle) * along_second + torch.sin(angle) * edges.opening[edge_index]
     )
     # The sign chooses the side, the rest is the cosine with the edge.
     edge_cosine = 4.0 * random[:, 3:4] - 2.0
@@ -741,7 +741,9 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
         + (1.0 - edge_cosine.square()).clamp_min(0.0).sqrt() * perpendicular
     )
 
-    normal = _orient_outwards(torch.linalg.cross(axis, perpendicular), first + second)
+    normal = _orient_outwards(
+        torch.linalg.cross(axis, perpendicular), along_first + along_second
+    )
     return _TangentSamples(
         ends=edges.ends[edge_index],
         fraction=random[:, 1],
@@ -758,10 +760,11 @@ class _ExteriorAngles(NamedTuple):
     axis: Tensor  # (E, 3) unit vector along the edge
     # (E, 3) unit vectors along both faces, perpendicular to the edge; the same vector
     # twice where there is one face
-    first: Tensor
-    second: Tensor
-    # (E, 3) unit vector, perpendicular to edge and `second`, to which the angle opens
-    turned: Tensor
+    along_first: Tensor
+    along_second: Tensor
+    # (E, 3) unit vector, perpendicular to the edge and to `along_second`, to which the
+    # angle opens
+    opening: Tensor
     angle: Tensor  # (E,) exterior angle, radians
 
 
@@ -775,50 +778,55 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     # Sides of faces edge by edge; those of an edge end at entry `last`.
     order = torch.argsort(owner, stable=True)
     n_faces = torch.bincount(owner, minlength=len(ends))
-    last = n_faces.cumsum(dim=0) - 1
+    last_entry = n_faces.cumsum(dim=0) - 1
     length = (vertices[ends[:, 1]] - vertices[ends[:, 0]]).norm(dim=1)
-    proper = (n_faces <= 2) & (length > 0.0)
-    ends = ends[proper]
-    is_single = n_faces[proper] == 1
+    is_measured = (n_faces <= 2) & (length > 0.0)
+    ends = ends[is_measured]
+    is_single = n_faces[is_measured] == 1
     axis = _compute_edge_directions(vertices, ends)
 
     def along_face(entry: Tensor) -> Tensor:
         """Return unit vectors along one of an edge's faces, perpendicular to it."""
-        vector = vertices[across[order[entry[proper]]]] - vertices[ends[:, 0]]
+        vector = vertices[across[order[entry[is_measured]]]] - vertices[ends[:, 0]]
         return torch.nn.functional.normalize(
             vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1
         )
 
-    first = along_face(last - n_faces + 1)
-    second = along_face(last)
-    turned, angle = _measure_between_faces(first, second, axis, is_single)
+    along_first = along_face(last_entry - n_faces + 1)
+    along_second = along_face(last_entry)
+    opening, angle = _measure_between_faces(along_first, along_second, axis, is_single)
     return _ExteriorAngles(
-        ends=ends, axis=axis, first=first, second=second, turned=turned, angle=angle
+        ends=ends,
+        axis=axis,
+        along_first=along_first,
+        along_second=along_second,
+        opening=opening,
+        angle=angle,
     )
 
 
 def _measure_between_faces(
-    first: Tensor, second: Tensor, axis: Tensor, is_single: Tensor
+    along_first: Tensor, along_second: Tensor, axis: Tensor, is_single: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return where the exterior angles of edges open to (N, 3), and their sizes (N,).
 
-    The directions of an exterior angle are cos(t) second + sin(t) turned, with t from 0
+    The directions of an exterior angle are cos(t) along_second + sin(t) opening, with t from 0
     to the angle: it is pi minus the angle between the faces, and pi at a single face.
 
     Args:
-        first, second: (N, 3) unit vectors along both faces, perpendicular to the edge.
+        along_first, along_second: (N, 3) unit vectors along both faces, perpendicular to the edge.
         axis: (N, 3) unit vectors along the edges.
         is_single: (N,) whether an edge has only one face.
     """
-    cosine = (first * second).sum(dim=1, keepdim=True)
-    perpendicular = first - cosine * second
-    turned = torch.where(
+    cosine = (along_first * along_second).sum(dim=1, keepdim=True)
+    perpendicular = along_first - cosine * along_second
+    opening = torch.where(
         is_single[:, None],
-        torch.linalg.cross(axis, second),
+        torch.linalg.cross(axis, along_second),
         -torch.nn.functional.normalize(perpendicular, dim=1),
     )
     angle = torch.pi - torch.atan2(perpendicular.norm(dim=1), cosine[:, 0])
-    return turned, angle
+    return opening, angle
 
 
 def _compute_edge_directions(vertices: Tensor, ends: Tensor) -> Tensor:

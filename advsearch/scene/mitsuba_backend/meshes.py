@@ -260,8 +260,8 @@ def make_mitsuba_mesh(
     parameters[FACES] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
     parameters.update()
     for key, values in mesh.attributes.items():
-        flat = np.ascontiguousarray(values, np.float32).ravel()
-        plugin.add_attribute(key, values.shape[1], flat)
+        flat_values = np.ascontiguousarray(values, np.float32).ravel()
+        plugin.add_attribute(key, values.shape[1], flat_values)
     return plugin
 
 

@@ -388,6 +388,7 @@ def _translate_beam(part: parts.BeamLamp) -> Translation:
     slanted by it.
     """
     height, width = part.table.shape
+    # Middles of the table's cells, on a plane at distance 1.
     x = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2]
     y = np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
     cosine = (1.0 + x[None] ** 2 + (y[:, None] * height / width) ** 2) ** -0.5

@@ -228,8 +228,10 @@ def import_mitsuba_scene(
         f"{where}: {clause}"
         for clause in (*left_out_clauses, *surface.notes, *missing_clauses)
     ]
-    turn = frame.turn.astype(np.float32)
-    mesh = replace(mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T)
+    rotation = frame.rotation.astype(np.float32)
+    mesh = replace(
+        mesh, vertices=mesh.vertices @ rotation.T, normals=mesh.normals @ rotation.T
+    )
     mesh, base_color = _paint(mesh, has_uvs, surface, str(shape["type"]), where)
     source = scene if isinstance(scene, Path) else Path("scene.xml")
     asset = ObjectAsset(
@@ -503,29 +505,34 @@ class _ObjectFrame:
     """The object's coordinates: z up, standing on z = 0, with a largest extent of 1.
 
     Attributes:
-        turn: (3, 3) rotation from the scene's coordinates to z up.
+        rotation: (3, 3) rotation from the scene's coordinates to z up.
         size: largest extent in the scene's units.
         matrix: (4, 4) from the scene's coordinates to the object's.
     """
 
     def __init__(self, mesh: Mesh, name: str, *, z_up: bool) -> None:
-        turn = np.eye(4) if z_up else Y_TO_Z
-        turned = mesh.vertices.astype(np.float64) @ turn[:3, :3].T
-        lower = turned.min(axis=0)
-        upper = turned.max(axis=0)
-        self.turn = turn[:3, :3]
+        """Measure a mesh, in the scene's coordinates, for the object of a name.
+
+        Without `z_up` the scene's y axis points up. Raises InputError: it has no
+        extent.
+        """
+        to_z_up = np.eye(4) if z_up else Y_TO_Z
+        vertices = mesh.vertices.astype(np.float64) @ to_z_up[:3, :3].T
+        lower = vertices.min(axis=0)
+        upper = vertices.max(axis=0)
+        self.rotation = to_z_up[:3, :3]
         self.size = float((upper - lower).max())
         if not (math.isfinite(self.size) and self.size > 0.0):
             raise InputError(
                 f"object {name}: expected a shape of some size, got one of {self.size}"
             )
-        move = np.eye(4)
-        move[:3, 3] = (
+        translation = np.eye(4)
+        translation[:3, 3] = (
             -(lower[0] + upper[0]) / 2,
             -(lower[1] + upper[1]) / 2,
             -lower[2],
         )
-        self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ move @ turn
+        self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ translation @ to_z_up
 
     def move_plugin(
         self, plugin: Mapping[str, object], *, at_top: bool = True
@@ -571,11 +578,11 @@ class _ObjectFrame:
         entries = dict(plugin)
         if "direction" in entries:
             direction = np.asarray(entries["direction"], dtype=np.float64)
-            entries["direction"] = (self.turn @ direction).tolist()
+            entries["direction"] = (self.rotation @ direction).tolist()
         elif plugin["type"] != "constant":
-            turn = np.eye(4)
-            turn[:3, :3] = self.turn
-            entries["to_world"] = turn @ shapes.get_pose(plugin)
+            rotation = np.eye(4)
+            rotation[:3, :3] = self.rotation
+            entries["to_world"] = rotation @ shapes.get_pose(plugin)
         return entries
 
     def _move_lamp(self, plugin: Mapping[str, object]) -> Plugin:

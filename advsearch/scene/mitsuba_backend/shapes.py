@@ -225,10 +225,10 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
         InputError: its pose has no volume.
     """
     shape_pose = np.eye(4)
-    turns = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)
+    fractions = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)
     normals = None
     if kind == "sphere":
-        uvs, faces = _make_grid(turns, turns[::2])
+        uvs, faces = _make_grid(fractions, fractions[::2])
         polar = np.pi * uvs[:, 1]
         vertices = np.stack(
             [*(np.sin(polar) * _compute_circle_points(uvs[:, 0])), np.cos(polar)],
@@ -238,12 +238,12 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
         shape_pose[:3, :3] *= _get_radius(shape)
         shape_pose[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
     elif kind == "cylinder":  # open at both ends, as Mitsuba's
-        uvs, faces = _make_grid(turns, np.array([0.0, 1.0]))
+        uvs, faces = _make_grid(fractions, np.array([0.0, 1.0]))
         vertices = np.stack([*_compute_circle_points(uvs[:, 0]), uvs[:, 1]], axis=1)
         normals = vertices * (1.0, 1.0, 0.0)
         shape_pose = _compute_cylinder_pose(shape)
     elif kind == "disk":
-        uvs, faces = _make_grid(turns[::8], turns)
+        uvs, faces = _make_grid(fractions[::8], fractions)
         vertices = np.stack(
             [*(uvs[:, 0] * _compute_circle_points(uvs[:, 1])), np.zeros(len(uvs))],
             axis=1,
@@ -560,7 +560,10 @@ def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]
 
 
 def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
-    """Return clauses about what of a surface is not as in the scene."""
+    """Return clauses about what of a surface is not as in the scene.
+
+    `linear` are the linear values of its base color, of any shape.
+    """
     notes = []
     types = {str(plugin["type"]) for plugin in iterate_plugins(surface)}
     if BASE_COLOR not in types:

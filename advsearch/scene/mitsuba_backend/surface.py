@@ -561,8 +561,10 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
     with mitsuba_lock:
         # three channels a layer, all layers of a ray, ray by ray
         u, v, weight = (
-            np.stack([layer.numpy() for layer in channels[first::3]], axis=1).ravel()
-            for first in (4, 5, 6)
+            np.stack(
+                [layer.numpy() for layer in channels[first_channel::3]], axis=1
+            ).ravel()
+            for first_channel in (4, 5, 6)
         )
         (hits,) = np.nonzero(weight)
         n_layers = len(weight) // (math.prod(size) * RAYS_PER_PIXEL)

@@ -87,10 +87,10 @@ def trace_texel_rays(
     shifts = np.random.default_rng(seed).random((n_texels, 2), dtype=np.float32)
     met_cells = np.empty((n_texels, n_rays), dtype=np.int32)
     texels_per_launch = max(1, RAYS_PER_LAUNCH // n_rays)
-    for begin in range(0, n_texels, texels_per_launch):
-        batch = slice(begin, min(n_texels, begin + texels_per_launch))
+    for start in range(0, n_texels, texels_per_launch):
+        batch = slice(start, min(n_texels, start + texels_per_launch))
         # one lane for each ray, texel by texel
-        lane = dr.arange(mi.UInt32, (batch.stop - begin) * n_rays)
+        lane = dr.arange(mi.UInt32, (batch.stop - start) * n_rays)
         texel = lane // n_rays
         ray_index = lane % n_rays
         shift = _to_drjit_points(mi.Point2f, shifts[batch], texel)
@@ -103,7 +103,7 @@ def trace_texel_rays(
             normal=_to_drjit_points(mi.Normal3f, normals[batch], texel),
             position=_to_drjit_points(mi.Point3f, positions[batch], texel),
             square=square,
-            seed=(seed, begin),
+            seed=(seed, start),
         )
         met_cells[batch] = met.numpy().reshape(-1, n_rays)
     return met_cells

@@ -190,7 +190,7 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
     Returns:
         Whether the dictionary has such an entry.
     """
-    name, *rest = key_parts
+    name, *inner_parts = key_parts
     if name.startswith("brdf_") and name not in plugin:
         # the surface of both sides is the only inner plugin
         inner_names = [
@@ -201,8 +201,8 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
     entry = plugin.get(name)
     if isinstance(entry, Mapping):
         plugin[name] = dict(entry)
-        return bool(rest) and _put_input(plugin[name], rest, value)
-    if rest or (entry is None and name not in OPTIONAL_ENTRIES):
+        return bool(inner_parts) and _put_input(plugin[name], inner_parts, value)
+    if inner_parts or (entry is None and name not in OPTIONAL_ENTRIES):
         return False
     if name == "bitmap":
         plugin[name] = mi.Bitmap(np.ascontiguousarray(value))

@@ -37,11 +37,11 @@ def _is_convex(corners: Float64Array) -> bool:
     """
     edges = np.roll(corners, -1, axis=0) - corners
     # cross products of successive edges
-    turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
+    cross_products = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
         edges[:, 0], -1
     )
-    smallest = float(turns.min())
-    largest = float(turns.max())
+    smallest = float(cross_products.min())
+    largest = float(cross_products.max())
     rounding = 1e-9 * max(-smallest, largest)
     return rounding > 0.0 and (smallest >= -rounding or largest <= rounding)
 
@@ -69,10 +69,10 @@ class SolidEntry(_Entry):
     @model_validator(mode="after")
     def _check_form(self) -> SolidEntry:
         """Check that an entry has one convex outline, or a radius and positions."""
-        is_round = self.at is not None and self.radius is not None
-        if is_round == (self.outline is not None) or (self.at is None) != (
-            self.radius is None
-        ):
+        has_positions = self.at is not None
+        has_radius = self.radius is not None
+        has_outline = self.outline is not None
+        if has_positions != has_radius or has_radius == has_outline:
             raise ValueError(
                 "expected either an outline, or a radius and the "
                 "positions that it is at"

@@ -84,14 +84,14 @@ class SurfaceView:
         n_rays = height * width * RAYS_PER_PIXEL
         first_sample = camera_index * n_rays
         bounds = torch.tensor([camera_index, camera_index + 1]) * n_rays
-        begin, end = torch.searchsorted(samples.sample, bounds).tolist()
-        pixel = (samples.sample[begin:end] - first_sample) // RAYS_PER_PIXEL
+        start, end = torch.searchsorted(samples.sample, bounds).tolist()
+        pixel = (samples.sample[start:end] - first_sample) // RAYS_PER_PIXEL
         # (n, 4) cells and weights of the bilinear look-ups; those on the back are in
         # the second half of the columns.
-        columns, fractions = find_bilinear_weights(samples.uv[begin:end].numpy(), shape)
-        is_back = samples.is_back[begin:end].numpy()
+        columns, fractions = find_bilinear_weights(samples.uv[start:end].numpy(), shape)
+        is_back = samples.is_back[start:end].numpy()
         columns += np.int32(n_cells) * is_back[:, None]
-        weights = fractions * samples.weight[begin:end].numpy()[:, None]
+        weights = fractions * samples.weight[start:end].numpy()[:, None]
         # Samples are in the order of pixels, with four entries each.
         row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
         self.matrix = scipy.sparse.csr_matrix(
@@ -414,11 +414,11 @@ class Arrangement:
         """Return a base color (h, w, 3) on the fine grid, (cells, 3);
         differentiable.
         """
-        flat = color.reshape(-1, 3)
+        flat_color = color.reshape(-1, 3)
         return (
-            flat
+            flat_color
             if self._upsampling is None
-            else multiply_sparse(self._upsampling, flat)
+            else multiply_sparse(self._upsampling, flat_color)
         )
 
     def compute_light(self, padded: Tensor, color: Tensor) -> ArrangementLight:

@@ -61,10 +61,10 @@ class MapFingerprint:
     @classmethod
     def compute(cls, padded: Tensor) -> MapFingerprint:
         """Return the fingerprint of a map (H, W + 2, 3)."""
-        flat = padded.reshape(-1, 3)
-        mean = flat.mean(dim=0)
-        step = max(1, len(flat) // N_COMPARED_TEXELS)
-        return cls(mean, flat[::step] / mean.clamp_min(1e-12))
+        texels = padded.reshape(-1, 3)
+        mean = texels.mean(dim=0)
+        stride = max(1, len(texels) // N_COMPARED_TEXELS)
+        return cls(mean, texels[::stride] / mean.clamp_min(1e-12))
 
     def find_factor(self, other: MapFingerprint) -> Tensor | None:
         """Return how many times as bright (3,) another map is.

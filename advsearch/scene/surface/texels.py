@@ -67,7 +67,10 @@ class LitTexels:
 
 
 def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
-    """Join the texels of several surfaces, each with one grid."""
+    """Join the texels of several surfaces, each with one grid.
+
+    Cells and texels are numbered on from one surface to the next.
+    """
     texel_bounds = np.cumsum([0] + [len(texels.positions) for texels in surfaces])
     cell_bounds = np.cumsum([0] + [texels.grids[0].n_cells for texels in surfaces])
     grids = []

@@ -177,8 +177,8 @@ def _sample_configurations(group: Group, reference: Tensor) -> Iterator[Tensor]:
     """
     fractions = list(PROBE_FRACTIONS)
     if group.options:
-        step = -(-group.options // MAX_OPTIONS)
-        options = range(0, group.options, step)
+        stride = -(-group.options // MAX_OPTIONS)
+        options = range(0, group.options, stride)
         fractions = [(option + 0.5) / group.options for option in options]
     values = [torch.full((group.size,), fraction) for fraction in fractions]
     if group.size > 1:
@@ -273,12 +273,12 @@ class BasisMaps:
         With several maps it is the weighted least squares fit; a single map is taken
         for proportional to the target. The weights are differentiable.
         """
-        flat = target.permute(2, 0, 1).reshape(3, -1, 1)
+        flat_target = target.permute(2, 0, 1).reshape(3, -1, 1)
         # Exact and cheap: the factor of a channel, at the map's brightest texel.
         if len(self.maps) == 1:
             texel, brightness = self._brightest
-            return (flat[..., 0].gather(1, texel) / brightness.clamp_min(TINY)).T
-        weights: Tensor = (self._inverse @ flat)[..., 0].T
+            return (flat_target[..., 0].gather(1, texel) / brightness.clamp_min(TINY)).T
+        weights: Tensor = (self._inverse @ flat_target)[..., 0].T
         return weights
 
     def compose(self, weights: Tensor) -> Tensor:
@@ -290,8 +290,8 @@ class BasisMaps:
         """The brightest texel of the first map in each channel (3, 1), and its
         value.
         """
-        flat = self.maps[0].reshape(-1, 3)
-        return flat.argmax(dim=0)[:, None], flat.amax(dim=0)[:, None]
+        texels = self.maps[0].reshape(-1, 3)
+        return texels.argmax(dim=0)[:, None], texels.amax(dim=0)[:, None]
 
     @cached_property
     def _inverse(self) -> Tensor:

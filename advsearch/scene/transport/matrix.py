@@ -350,11 +350,11 @@ class TextureTransport:
 
         What a cell gets is spread evenly over its texels.
         """
-        flat = cotangent.reshape(-1, 3)
-        texel_values = self._sharp.multiply_transposed(flat).reshape(
+        pixel_cotangent = cotangent.reshape(-1, 3)
+        texel_values = self._sharp.multiply_transposed(pixel_cotangent).reshape(
             *self._texture_shape, 3
         )
-        cell_values = self._scattered.multiply_transposed(flat).reshape(
+        cell_values = self._scattered.multiply_transposed(pixel_cotangent).reshape(
             *self._cell_shape, 3
         )
         cell_values = cell_values / self._texels_in_cell

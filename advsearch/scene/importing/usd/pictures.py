@@ -93,7 +93,11 @@ def decode_image(data: bytes, path: str, *, is_srgb: bool) -> Array:
 
 
 def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
-    """Return the stored values (H, W, 4) in [0, 1] of an image file."""
+    """Return the stored values (H, W, 4) in [0, 1] of an image file.
+
+    Greys of integers are divided by the largest of 16 bits, those of floats are taken
+    as they are.
+    """
     with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
         reading.check_decodable(image, path)
         if image.mode == "F" or image.mode.startswith("I"):

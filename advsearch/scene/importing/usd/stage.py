@@ -392,7 +392,13 @@ class Conversion:
             node["moved"] = rest_matrix.ravel().tolist()
         triangles, face = self._triangulate(mesh, points, counts, corners)
         primitives = self._make_primitives(
-            prim, mesh, points, counts, corners, triangles, face
+            prim,
+            mesh,
+            points=points,
+            counts=counts,
+            corners=corners,
+            triangles=triangles,
+            face=face,
         )
         if primitives:
             node["mesh"] = len(self.header["meshes"])

@@ -293,7 +293,7 @@ class UsdSurfaces:
         shader = material.ComputeSurfaceSource()[0]
         if not shader or shader.GetIdAttr().Get() != PREVIEW_SURFACE:
             self.note("has a material that is no UsdPreviewSurface, which is grey here")
-            grey = [0.2140, 0.2140, 0.2140, 1.0]
+            grey = [0.2140, 0.2140, 0.2140, 1.0]  # linear: 0.5 in sRGB; and opaque
             surface = {
                 "baseColorFactor": grey,
                 "metallicFactor": 0.0,
