@@ -264,9 +264,10 @@ class Command(Task):
         return () if truth is None else (self._format_action(truth.tolist()),)
 
     def _deviation(self, output: Tensor, center: Tensor | None) -> Tensor:
-        """Compute the deviation of each element from an action in envelopes, (N, A).
+        """Compute the deviation of each element from an action `center` (A,), in
+        envelopes, (N, A).
 
-        It is 0 where the action is NaN.
+        It is 0 for an element that is NaN in `center`, which is not judged.
         """
         if center is None:
             raise InputError(
