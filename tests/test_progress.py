@@ -127,29 +127,6 @@ def test_the_samples_of_the_smallest_change_are_those_of_the_clean_scene() -> No
     assert {row.name for row in findings.sample_count.table} == {"clean"} and findings.spp == 16
 
 
-@dataclass
-class OftenWrong(Easy):
-    """Wrong wherever it is moved a little, and in two of three renders where it is not."""
-
-    renders: int = 0
-
-    def _logits(self, u: torch.Tensor, seed: int) -> torch.Tensor:
-        self.renders += 1
-        logits = super()._logits(u, seed)
-        return -logits if self.renders % 3 and (u == 0.5).all() else logits
-
-
-def test_no_smallest_change_is_sought_where_no_change_is_needed() -> None:
-    problem = OftenWrong()
-    blocks = tuple(block for block in problem.domain.blocks if block.epsilon is not None)
-    problem.domain = type(problem.domain)(torch.full((4,), 0.5), blocks)
-    progress, findings = attacked(configuration(smallest=True), problem)
-    assert any(trial.right for trial in findings.first_look), "the first look was not enough to tell"
-    assert sum(trial.right for trial in findings.clean_trials) < len(findings.clean_trials) / 2
-    assert findings.search is None and findings.bracket is None and findings.verification is None
-    assert not progress.named("search 1 of")
-
-
 def test_samples_of_the_ladder_have_a_bound() -> None:
     spent = 0
 
