@@ -371,7 +371,6 @@ NOT_MESSAGES = (
     "advsearch.scene.importing.usd.layers",
 )
 """Modules that read or write flags themselves, also those of another program, and a style sheet."""
-"""Calls whose texts are for the help of the command line."""
 
 
 def texts_of_people(source: str) -> Iterator[tuple[int, str]]:

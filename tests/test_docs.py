@@ -262,6 +262,3 @@ def test_the_predictor_of_the_page_is_as_good_as_a_render() -> None:
         lambda view: compare_with_traced(renderer, picture.detach(), still, view, 16, lambda *_: 0.0)
     )
     assert deviation.is_accepted, deviation.reason
-
-
-# ---- the scripts ----------------------------------------------------------------------------------------------------

@@ -14,14 +14,11 @@ import torch
 from advsearch.attacks import Evaluation, Query, make_policy
 from advsearch.attacks.trials import choose_spp, count_max_samples
 from advsearch.cli.flags import format_as_flags
-from advsearch.cli.output import format_result as check_text
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import RunState
 from advsearch.experiment import run_experiment as answered
 from advsearch.progress import Stages
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.check import check
-from advsearch.questions.check.result import CheckConfig
 from advsearch.questions.precision.result import PrecisionConfig
 from advsearch.questions.region import boxes
 from advsearch.questions.region.result import RegionConfig
@@ -179,16 +176,6 @@ def test_every_command_says_what_it_does_and_how_far_it_is(tmp_path: Path, confi
     progress.check()
     hints = [format_as_flags(one.hint) for one in progress.stages]
     assert any("--" in one for one in hints) and not any("`" in one for one in hints)
-
-
-@pytest.mark.slow
-def test_a_check_counts_what_it_says(tmp_path: Path) -> None:
-    progress = Recorded()
-    asked = {"controls": {"environment.rotation": {}}, "loss": "model", "run": str(tmp_path / "run")}
-    whole = check.run(CheckConfig(**SMALL, **asked), progress=progress)
-    progress.check()
-    assert whole.ending == "done" and whole.gains and len(progress.messages) == len(whole.rows)
-    assert "How a search gets its derivatives" in check_text(whole)
 
 
 # ---- what is stored is not rendered again ---------------------------------------------------------------------------

@@ -71,9 +71,6 @@ def test_a_real_detector_and_a_real_segmenter_are_fooled(case: str, real_data: P
     assert (tmp_path / "run" / "images" / "adversarial-prediction.png").is_file()
 
 
-"""By objective: what the detector sees then, of a mug that stands on a table and which it sees where it is before."""
-
-
 THINGS = {
     "detection": ("mug", "ssd_mobilenet_v1_coco_300", "cup"),
     "segmentation": ("bottle", "deeplabv3_mnv2_dm05_pascal_257", "bottle"),

@@ -11,19 +11,16 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
-from torch import Tensor
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 import advsearch
-from advsearch.api.export import make_printable_pieces
 from advsearch.controls import make_control, make_space
 from advsearch.engine.judging import mean_variation, printable_distance
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.raster import find_exclusive_texels, find_read_texels, look_up_texture
-from advsearch.scene.transport.matrix import LinearRenderer
 
 Box = tuple[Sequence[float], Sequence[float]]
 CAR: dict[str, list[Box]] = {
@@ -243,54 +240,6 @@ def test_materials_that_share_all_their_texels_cannot_be_painted_alone(tmp_path:
 
 
 # ---- what takes part in a search -------------------------------------------------------------------------------------
-
-
-def levels(one: Tensor, other: Tensor) -> float:
-    return 255.0 * float(((one - other) ** 2).mean().sqrt())
-
-
-@pytest.mark.medium
-def test_a_matrix_predicts_what_is_painted_beside_and_behind_glass(scene: advsearch.Scene) -> None:
-    """Half of the light passes through the glass, which lets the matrix see what is behind it."""
-    renderer = scene.renderer({"texture": {"materials": ["Body Paint", "glass"]}}, resolution=32)
-    predicted = LinearRenderer(renderer, renderer.start, seed=1)
-    with torch.no_grad():
-        one, other = (renderer(renderer.start, seed=seed, spp=256) for seed in (11, 12))
-        assert levels(predicted(renderer.start), one) < 1.5 * levels(one, other)
-        for sign in (1.0, -1.0):
-            u = (renderer.start + 0.1 * sign).clamp(0.0, 1.0)
-            change = renderer(u, seed=11, spp=256) - one
-            off = levels(predicted(u) - predicted(renderer.start), change)
-            assert off < 1.5 and levels(change, torch.zeros(())) > 4.0 * off
-
-
-class Red(torch.nn.Module):
-    """A car where the middle of a picture is red, else a van."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        middle = x[:, :, 12:24, 6:26].mean(dim=(2, 3))
-        car = 40.0 * (middle[:, 0] - middle[:, 1] - 0.1)
-        return torch.stack([car, -car], dim=1)
-
-
-@pytest.mark.medium
-def test_a_search_over_the_paint_of_a_car_with_glass_renders_nothing(file: Path, tmp_path: Path) -> None:
-    """All other texels are those of the file, also in what is kept; what is printed is the paint."""
-    model = advsearch.load_model(Red(), labels=["car", "van"], input_size=32, name="red")
-    controls = {"texture": {"materials": ["Body Paint"], "epsilon": 0.5}}
-    settings: Any = {"label": "car", "resolution": 32, "steps": 16, "trials": 6, "baseline": False, "verify_spp": 8}
-    run = tmp_path / "run"
-    found = advsearch.attack(file, model=model, controls=controls, run=run, **settings).summary
-    assert found.ending == "found" and found.transport is not None and found.transport.used
-    assert found.renders["products"] == 16 and found.renders["gradient"] == 0
-    before, after = (np.array(Image.open(run / "artifacts" / f"texture{one}.png")) for one in ("-original", ""))
-    asset = import_object(file)
-    painted = find_exclusive_texels(asset.mesh, asset.mesh.materials["Body Paint"], (512, 512))[0]
-    changed = (before != after).any(axis=2)
-    assert changed.any() and not changed[~painted].any()
-    length, width, height = 100.0, 40.0, 15.0  # of the body's box, where the car is as long
-    sizes = sum(int(piece.size[0] * piece.size[1]) for piece in make_printable_pieces(run, length))
-    assert sizes == pytest.approx(2 * (length * width + length * height + width * height), rel=0.1)
 
 
 def test_print_terms_count_what_is_painted() -> None:

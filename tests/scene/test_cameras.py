@@ -97,8 +97,7 @@ def test_a_panorama_has_what_is_ahead_in_its_middle_and_the_zenith_on_top() -> N
 def test_a_lens_that_folds_says_at_which_angle_and_is_black_beyond() -> None:
     lens = LENSES[FOLDING]
     assert math.isclose(math.degrees(lens.fold_angle), math.degrees(math.atan(math.sqrt(1.0 / 1.8))), rel_tol=1e-6)
-    (note,) = lens.notes
-    assert "folds at 36.7 degrees" in note
+    assert len(lens.notes) == 1 and "36.7 degrees" in lens.notes[0]
     _, inside = lens.compute_rays(torch.tensor([[0.5, 0.5], [0.0, 0.0]], dtype=torch.float64))
     assert inside[0] > 0.0 > inside[1]
 
@@ -460,9 +459,9 @@ def test_truth_is_that_of_the_distorted_picture(camera: str, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("camera", "settings", "control", "words"),
     [
-        ("fisheye", {"camera.fov": 90.0}, {}, "camera.fov contradict"),
-        ("fisheye", {}, {"k5": 0.1}, "has the coefficients k1, k2, k3, k4, not k5"),
-        (None, {}, {"k1": 0.1, "aperture": 0.1}, "aperture is not supported with a lens with distortion"),
+        ("fisheye", {"camera.fov": 90.0}, {}, r"camera\.fov"),
+        ("fisheye", {}, {"k5": 0.1}, "k5"),
+        (None, {}, {"k1": 0.1, "aperture": 0.1}, "aperture"),
         (None, {"camera.fov": 60.0}, {"k1": -1.5}, "background"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Pictures that a matrix of light transport, or light on surfaces, predicts, where scenes are at their ends."""
+"""Pictures that light on surfaces predicts, where scenes are at their ends."""
 
 from __future__ import annotations
 
@@ -19,19 +19,13 @@ from advsearch.questions.stability.scene import (
     make_gray_environment,
     make_renderer,
     measure_inward_slope,
-    render_image,
 )
-from advsearch.questions.stability.scenes import FLASH, TEXTURE, make_glass_ball
+from advsearch.questions.stability.scenes import FLASH
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.surface.renderer import SurfaceRenderer
-from advsearch.scene.transport.lights import BasisRenderer
-from advsearch.scene.transport.matrix import LinearRenderer
 
 TRACED = 256
-"""Samples a pixel of the traced pictures, whose noise is the same before and after a change."""
-OFF = 0.15
-"""Root mean square error of a predicted change, as a share of the change: noise of the matrix, and light that meets the
-texture twice."""
+"""Samples a pixel of the traced pictures."""
 NIGHT = make_gray_environment(0.0)
 
 
@@ -40,81 +34,8 @@ def right(outcome: Outcome) -> None:
     assert outcome.finite and [str(number) for number in outcome.checks if not number.ok] == []
 
 
-def predicted(
-    controls: ControlSettings = TEXTURE,
-    thing: ObjectSource = "mug",
-    *,
-    epsilon: float = 0.1,
-    off: float = OFF,
-    **scene: object,
-) -> Outcome:
-    """Predict by a matrix how a picture changes where each number goes up or down by epsilon, by chance."""
-    renderer = make_renderer(controls, thing, **scene)  # type: ignore[arg-type]
-    linear, start = LinearRenderer(renderer, renderer.start, seed=1), renderer.start
-    signs = torch.randint(0, 2, start.shape, generator=torch.Generator().manual_seed(3)) * 2.0 - 1.0
-    u = (start + epsilon * signs).clamp(0.0, 1.0)
-    traced = render_image(renderer, u, 5, TRACED) - render_image(renderer, start, 5, TRACED)
-    with torch.no_grad():
-        change = linear(u) - linear(start)
-    _, slope = linear.renderer.gradient(lambda picture: picture.square().mean(), u, 0, 1)
-    size = float(traced.square().mean().sqrt())
-    error = float((change - traced).square().mean().sqrt()) / size if size else float(change.abs().max())
-    checks = [
-        check_range("error of the predicted change, as a share of it", error, most=off),
-        check_condition("the derivative is there where the picture changes", bool(slope.any()) == (size > 0.0)),
-    ]
-    finite = bool(torch.isfinite(change).all() and torch.isfinite(slope).all()) and linear.non_finite == 0
-    return Outcome(checks, finite, error, measured={"entries": float(linear.n_entries), "rms change": size})
-
-
-MIRROR = {"material.roughness": 0.0, "material.metallic": 1.0}
 AWAY = {"pose.x": 1e4}
-PREDICTED: dict[str, dict[str, Any]] = {
-    "4 texels": {"controls": {"texture": {"resolution": 2}}},
-    "black and white": {"thing": make_checkered_mug, "epsilon": 0.2, "off": 0.3},
-    "a mirror": {"settings": MIRROR, "off": 0.35},
-}
 
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PREDICTED)
-def test_changes_are_predicted(name: str) -> None:
-    right(predicted(**PREDICTED[name]))
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("scene", [{"settings": AWAY}, {"environment": NIGHT}])
-def test_a_texture_out_of_sight_or_without_light_changes_nothing(scene: dict[str, Any]) -> None:
-    right(predicted(**scene))
-
-
-@pytest.mark.medium
-def test_a_texture_behind_glass_is_predicted() -> None:
-    """Changes of a texture behind clear glass are predicted texel by texel."""
-    right(predicted({"texture": {"resolution": 32}}, plugins=make_glass_ball()))
-
-
-@pytest.mark.medium
-def test_a_lamp_that_goes_out_is_predicted() -> None:
-    """A lamp that goes out is predicted, to darkness."""
-    lamp: ControlSettings = {"light": {"power": [0.0, 12.0]}}
-    on, out = torch.ones(1), torch.zeros(1)
-    beside = make_renderer(lamp)
-    basis, alone = BasisRenderer(beside, on, seed=1), BasisRenderer(make_renderer(lamp, environment=NIGHT), on, seed=1)
-    traced = render_image(beside, out, 5, TRACED) - render_image(beside, on, 5, TRACED)
-    with torch.no_grad():
-        change, black = basis(out) - basis(on), alone(out)
-    _, slope = alone.renderer.gradient(lambda picture: picture.square().mean(), out, 0, 1)
-    error = float((change - traced).norm() / traced.norm())
-    finite = all(bool(torch.isfinite(values).all()) for values in (change, black, slope))
-    checks = [
-        check_range("error of the predicted change, as a share of it", error, most=OFF),
-        check_condition("without any light the picture is black", bool((black == 0.0).all())),
-    ]
-    right(Outcome(checks, finite, error))
-
-
-# ---- light on surfaces ----------------------------------------------------------------------------------------------
 
 LEVELS = 4.0
 """Levels of 255 by which a predicted picture may be off, root mean square. Most of that are edges: four rays a

@@ -108,38 +108,6 @@ def dashcam(name: object, environment: str = "street", **given: Any) -> SceneDes
     return load_scene(str(name), environment, camera="dashcam", **given).description
 
 
-@pytest.mark.parametrize(("front", "facing"), [("+z", None), ("+x", "+x")])
-def test_a_dashcam_sees_the_whole_rear_of_a_gltf_car(front: str, facing: str | None, tmp_path: Path) -> None:
-    """1.8 m of width are 24 of 160 pixels: f = 80 / tan 37.5 degrees, and the rear is 10 - 2.1 m away."""
-    path = write_car(tmp_path / "one.glb", front)
-    scene = load_scene(path, "street", camera="dashcam", facing=facing, settings={"camera.distance": 10})
-    render = scene.renderer({"camera": {"azimuth": [-0.01, 0.01]}}, resolution=160)
-    columns = np.flatnonzero((render.mask(render.start).reshape(160, 160) > 0.5).any(dim=0).numpy())
-    width = WIDE / (10.0 - LONG / 2.0) * 80.0 / np.tan(np.radians(37.5))
-    assert len(columns) == pytest.approx(width, abs=1.5)
-    assert columns.mean() == pytest.approx(79.5, abs=1.0)
-
-
-@pytest.mark.parametrize(
-    ("name", "camera", "settings", "told"),
-    [
-        ("car", "dashcam", {}, False),
-        ("car", "dashcam", {"camera.azimuth": 180.0}, True),
-        ("car", "dashcam", {"camera.azimuth": 90.0}, False),
-        ("car", None, {"camera.azimuth": 0.0, "camera.height": 1.3, "camera.distance": 10.0}, True),
-        ("car", None, {"camera.azimuth": 180.0, "camera.height": 1.3, "camera.distance": 10.0}, False),
-    ],
-)
-def test_a_camera_against_the_traffic_is_told(
-    name: str, camera: str | None, settings: dict[str, float], told: bool
-) -> None:
-    scene = load_scene(name, "street", camera=camera, settings=settings).description
-    notes = [note for note in scene.notes if "against the traffic" in note]
-    assert len(notes) == told
-    behind = 0 if camera else 180
-    assert all(note.endswith(f"behind it is `set` camera.azimuth={behind}") for note in notes)
-
-
 # ---- beside the object, around it, and written again -----------------------------------------------------------------
 
 

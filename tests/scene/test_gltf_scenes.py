@@ -199,6 +199,3 @@ def test_a_skin_that_is_none_is_refused(change: Any, words: str, tmp_path: Path)
     change(file.header)
     with pytest.raises(FileFormatError, match=words):
         vertices(file, tmp_path)
-
-
-# ---- how it is packed -----------------------------------------------------------------------------------------------

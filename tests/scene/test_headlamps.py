@@ -199,7 +199,7 @@ def test_a_texture_in_a_beam_has_the_gradient_of_differences() -> None:
     ("words", "error", "said"),
     [
         ({"things": "car@12,3.5,lamps=medium"}, UnknownNameError, "low"),
-        ({"environment": "street", "object.lamps": "low"}, InputError, "brightness of this environment has no unit"),
+        ({"environment": "street", "object.lamps": "low"}, InputError, "no unit"),
     ],
 )
 def test_what_cannot_shine_is_refused(words: dict[str, Any], error: type[InputError], said: str) -> None:

@@ -135,18 +135,17 @@ def test_texture_and_light_are_predicted_together() -> None:
 
 
 @pytest.mark.parametrize(
-    ("controls", "options", "reason"),
+    ("controls", "options", "can_predict"),
     [
-        ({"light": {"power": [0, 12]}}, {}, None),
-        ({"camera": {"exposure": [-1, 1]}}, {}, None),
-        ({"light": {"power": [0, 12]}}, {"estimators": {"light": "adjoint"}}, "the estimator of light.power is forced"),
-        ({"light": {}}, {}, "light.x changes more than base colours and light"),
-        ({"light": {"power": [0, 12]}}, {"denoise": "none"}, "noise is part of the picture without the denoiser"),
+        ({"light": {"power": [0, 12]}}, {}, True),
+        ({"camera": {"exposure": [-1, 1]}}, {}, True),
+        ({"light": {"power": [0, 12]}}, {"estimators": {"light": "adjoint"}}, False),
+        ({"light": {}}, {}, False),
+        ({"light": {"power": [0, 12]}}, {"denoise": "none"}, False),
     ],
 )
-def test_where_light_can_be_predicted(controls: Any, options: dict[str, Any], reason: str | None) -> None:
-    refusal = lights.find_refusal(rendered_by(controls, **options))
-    assert (None if refusal is None else refusal.text) == reason
+def test_where_light_can_be_predicted(controls: Any, options: dict[str, Any], can_predict: bool) -> None:
+    assert (lights.find_refusal(rendered_by(controls, **options)) is None) == can_predict
 
 
 # ---- searches -------------------------------------------------------------------------------------------------------

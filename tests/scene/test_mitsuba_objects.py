@@ -134,7 +134,7 @@ SHAPES = {
     ),
     **{
         f"painted {kind}": solid(kind, bsdf("twosided", bsdf("diffuse", picture())))
-        for kind in ("sphere", "cylinder", "cube")
+        for kind in ("sphere", "cylinder", "cube", "rectangle")
     },
     "red sphere": solid("sphere", bsdf("twosided", bsdf("diffuse", RED))),
 }

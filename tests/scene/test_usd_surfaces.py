@@ -383,6 +383,3 @@ def test_what_packages_may_not_name(tmp_path: Path, entries: dict[str, bytes]) -
     (folder / "scene.usda").write_text(referring("a.usdz"))
     with pytest.raises(FileFormatError, match=r"a\.usdz"):
         parts_of(folder / "scene.usda")
-
-
-# ---- Gaussian splats ------------------------------------------------------------------------------------------------
