@@ -1,4 +1,4 @@
-"""Scenes as Mitsuba's XML: what is written is what is read, and a picture on a shape is where Mitsuba has it."""
+"""Scenes as Mitsuba's XML: what is written is what is read."""
 
 from __future__ import annotations
 
