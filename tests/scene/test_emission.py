@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +28,7 @@ from advsearch.scene.mitsuba_backend.writing import write_scene
 from advsearch.scene.parts import PointLamp
 from advsearch.scene.transport.lights import BasisRenderer
 from advsearch.scene.transport.matrix import LinearRenderer
+from glb_files import change_material
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -59,22 +58,11 @@ def card(
     return trimesh.Trimesh(vertices, FACES, process=False, visual=TextureVisuals(uv=uv, material=material))
 
 
-def changed(data: bytes, material: int = 0, **entries: Any) -> bytes:
-    """A .glb file of which a material has other entries."""
-    length = struct.unpack_from("<I", data, 12)[0]
-    header = json.loads(data[20 : 20 + length])
-    header["materials"][material] |= entries
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
-
-
 def written(folder: Path, made: Any, strength: float = 1.0, **entries: Any) -> Path:
     """A file of it whose first material emits light of some strength."""
     file = folder / "lamp.glb"
     extensions = {"KHR_materials_emissive_strength": {"emissiveStrength": strength}}
-    file.write_bytes(changed(made.export(file_type="glb"), extensions=extensions, **entries))
+    file.write_bytes(change_material(made.export(file_type="glb"), extensions=extensions, **entries))
     return file
 
 

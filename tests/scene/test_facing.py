@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import import_scene
 from advsearch.scene.parts import MeshPart
+from glb_files import split_glb
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 LONG, WIDE, HIGH = 4.2, 1.8, 1.4  # metres of the car of boxes
@@ -140,8 +140,8 @@ def test_a_scene_file_is_turned_as_a_whole(tmp_path: Path) -> None:
 
 def file_vertices(data: bytes) -> np.ndarray:
     """The places of the first mesh in a binary glTF file, as they are written."""
-    length = int.from_bytes(data[12:16], "little")
-    header, buffer = json.loads(data[20 : 20 + length]), data[28 + length :]
+    header, rest = split_glb(data)
+    buffer = rest[8:]  # after the chunk's own header
     accessor = header["accessors"][header["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
     start = header["bufferViews"][accessor["bufferView"]]["byteOffset"]
     return np.frombuffer(buffer, "<f4", 3 * accessor["count"], start).reshape(-1, 3)

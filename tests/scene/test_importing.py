@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import struct
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +25,7 @@ from advsearch.scene.importing.objects import guess_up, import_object
 from advsearch.scene.importing.pictures import average_area, load_display_image
 from advsearch.scene.importing.texture import sample_colors, sample_texture
 from fuzz.pictures import plain_png
+from glb_files import join_glb, split_glb
 
 DATA = conftest.DATA / "objects"
 real_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the shared test data is not at {DATA}")
@@ -550,19 +550,6 @@ def png() -> bytes:
     return buffer.getvalue()
 
 
-def glb_of(header: dict[str, Any], rest: bytes = b"") -> bytes:
-    """Return a .glb file with a JSON chunk, and whatever comes after it."""
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
-
-
-def glb_parts(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the header of a .glb file, and what comes after it."""
-    length = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[20 : 20 + length]), data[20 + length :]
-
-
 NOISE = np.random.default_rng(0).bytes(3000)
 BAD: dict[str, Callable[[Path], Path]] = {
     "directory": lambda folder: folder,
@@ -590,7 +577,7 @@ BAD: dict[str, Callable[[Path], Path]] = {
     "cut stl": cut("t.stl", 0.8),
     "cut ascii stl": raw("t.stl", b"solid x\nfacet normal 0 0 1\n"),
     "compressed": raw(
-        "t.glb", glb_of({"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_draco_mesh_compression"]})
+        "t.glb", join_glb({"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_draco_mesh_compression"]})
     ),
     "old gltf": raw("t.gltf", b'{"asset": {"version": "1.0"}}'),
 }
@@ -727,11 +714,11 @@ def test_faces_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fac
 
 
 def test_instances_count_as_triangles(tmp_path: Path) -> None:
-    header, rest = glb_parts(exported(tmp_path, "ball.glb", trimesh.creation.icosphere(subdivisions=3)).read_bytes())
+    header, rest = split_glb(exported(tmp_path, "ball.glb", trimesh.creation.icosphere(subdivisions=3)).read_bytes())
     header["nodes"] = [{"mesh": 0, "translation": [k, 0, 0]} for k in range(1600)]
     header["scenes"] = [{"nodes": list(range(1600))}]
     with pytest.raises(FileFormatError, match="2,048,000"):
-        import_object(written(tmp_path, "thing.glb", glb_of(header, rest)))
+        import_object(written(tmp_path, "thing.glb", join_glb(header, rest)))
 
 
 def test_jpeg_with_too_many_scans_is_not_decoded(tmp_path: Path) -> None:
@@ -785,13 +772,13 @@ GLTF_CHANGES: dict[str, tuple[list[Any], Any]] = {
 @pytest.mark.parametrize("case", GLTF_CHANGES)
 def test_gltf_that_is_not_gltf(tmp_path: Path, case: str) -> None:
     (*path, key), value = GLTF_CHANGES[case]
-    header, rest = glb_parts(exported(tmp_path, "box.glb", trimesh.creation.box()).read_bytes())
+    header, rest = split_glb(exported(tmp_path, "box.glb", trimesh.creation.box()).read_bytes())
     place: Any = header
     for step in path:
         place = place[step]
     place[key] = value
     with pytest.raises(FileFormatError, match=r"thing\.glb"):
-        import_object(written(tmp_path, "thing.glb", glb_of(header, rest)))
+        import_object(written(tmp_path, "thing.glb", join_glb(header, rest)))
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"asset": {"version": "2.0"}, "scene": ' + "9" * 6000 + "}"])

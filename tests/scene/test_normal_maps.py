@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +24,7 @@ from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.parts import FLAT_TEXEL, make_normal_map
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.parts import PointLamp
+from glb_files import change_material
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -154,17 +153,6 @@ def test_a_bump_is_lit_as_its_geometry_from_two_sides(
     np.testing.assert_allclose(found, wanted, atol=0.06)
 
 
-def with_material(data: bytes, **entries: Any) -> bytes:
-    """A .glb file whose first material has other entries."""
-    length = struct.unpack_from("<I", data, 12)[0]
-    header = json.loads(data[20 : 20 + length])
-    header["materials"][0] |= entries
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
-
-
 def vectors(texels: Float32Array | None) -> np.ndarray:
     assert texels is not None
     return texels.astype(np.float64) * 2.0 - 1.0
@@ -177,7 +165,7 @@ def of_the_bump(scale: float = 1.0) -> np.ndarray:
 @pytest.mark.parametrize("scale", [0.5, 2.0, -1.0, 1e30, 0.0])
 def test_the_scale_of_gltf_is_a_factor_of_the_slope(scale: float, tmp_path: Path) -> None:
     file = tmp_path / "card.glb"
-    file.write_bytes(with_material(card().export(file_type="glb"), normalTexture={"index": 0, "scale": scale}))
+    file.write_bytes(change_material(card().export(file_type="glb"), normalTexture={"index": 0, "scale": scale}))
     normals, plain = vectors(import_object(file).normal_map), bump() / 127.5 - 1.0
     assert np.abs(np.linalg.norm(normals, axis=2) - 1.0).max() < 1e-5 and normals[..., 2].min() > 0.0
     at = (60, 80)

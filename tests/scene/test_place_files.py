@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import struct
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +23,7 @@ from advsearch.scene.grounds import LUMINANCE, compute_irradiance, has_lanes, is
 from advsearch.scene.library import import_environment, load_environment
 from advsearch.scene.places import place_meshes
 from advsearch.scene.places.place_file import load_bundled_place, read_place_file
+from glb_files import change_header
 from scenes.files import exr
 from scenes.places import PLACES
 from scenes.places.models import Look, Node, PlaceModel, Primitive
@@ -228,18 +226,6 @@ def test_a_variant_keeps_the_name_of_what_it_changes_as_a_whole(street: Path) ->
     assert (snow["snow"].mesh.normals[:, 2] == 1.0).all() and snow["snow"].base_color.max() > 0.89
 
 
-def rewrite_header(mesh: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    """Change the header of a binary glTF file."""
-    data = mesh.read_bytes()
-    (length,) = struct.unpack_from("<12xI", data)
-    header, rest = json.loads(data[20 : 20 + length]), data[20 + length :]
-    change(header)
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    body = struct.pack("<I4s", len(text), b"JSON") + text + rest
-    mesh.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
-
-
 def paint_road(street: Path, materials: int, factor: float, nearest: bool = False) -> None:
     """Give the road as many materials that share one picture of 8 x 8, each with a piece of its own."""
     road = box("road", (-40, -8, -0.5), (40, 8, 0), 0.3).mesh
@@ -256,7 +242,7 @@ def paint_road(street: Path, materials: int, factor: float, nearest: bool = Fals
             surface["baseColorFactor"] = [factor, factor, factor, 1.0]
         header["samplers"][0]["magFilter"] = 9728 if nearest else 9729
 
-    rewrite_header(mesh, share)
+    mesh.write_bytes(change_header(mesh.read_bytes(), share))
     write(street, lamps={})
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from advsearch.scene.importing.scenes import LUMENS
 from advsearch.scene.mitsuba_backend.parts import translate_part
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.parts import PointLamp, SpotLamp
+from glb_files import change_header
 
 ROUND = {"roughnessFactor": 0.8, "metallicFactor": 0.0}
 
@@ -30,16 +30,6 @@ def box(extents: list[float], color: list[int]) -> Any:
     made = trimesh.creation.box(extents=extents)
     made.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[*color, 255], **ROUND))
     return made
-
-
-def with_header(data: bytes, change: Any) -> bytes:
-    """Return a .glb file with another header."""
-    length = struct.unpack_from("<I", data, 12)[0]
-    header, rest = json.loads(data[20 : 20 + length]), data[20 + length :]
-    change(header)
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
 
 
 def add(header: dict[str, Any], node: dict[str, Any]) -> None:
@@ -64,7 +54,7 @@ def data() -> bytes:
     scene.add_geometry(box([10.0, 6.0, 0.2], [150, 80, 50]), "the wall", "wall", transform=place([0.0, 3.0, -5.0]))
     scene.add_geometry(box([2.0, 2.0, 2.0], [200, 180, 30]), "crate", "crate", transform=place([1.0, 1.0, 0.0]))
     exported: bytes = scene.export(file_type="glb")
-    return with_header(exported, five_nodes)
+    return change_header(exported, five_nodes)
 
 
 @pytest.fixture
@@ -118,7 +108,7 @@ def test_an_object_brings_what_hangs_on_it(data: bytes, tmp_path: Path) -> None:
                 one.remove(number["the wall"])
 
     file = tmp_path / "room.glb"
-    file.write_bytes(with_header(data, under))
+    file.write_bytes(change_header(data, under))
     scene = load_description(f"{file}#crate")
     assert set(scene.meshes) == {"object", "floor"}
     assert float(np.ptp(scene.base_vertices, axis=0).max()) == pytest.approx(1.0)
@@ -136,7 +126,7 @@ DOWN = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 
 def test_a_spot_shines_in_its_cone(file: Path, data: bytes) -> None:
     cone = {"innerConeAngle": math.radians(10.0), "outerConeAngle": math.radians(30.0)}
-    file.write_bytes(with_header(data, lambda header: shone(header, cone, DOWN)))
+    file.write_bytes(change_header(data, lambda header: shone(header, cone, DOWN)))
     scene = load_description(f"{file}#crate")
     assert scene.environment is None and not any("spot" in note for note in scene.notes)
     lamp = scene.lamps["bulb"]
@@ -164,7 +154,7 @@ def test_a_spot_lights_in_mitsuba_as_it_is_metered() -> None:
 
 @pytest.mark.parametrize("cone", [{"outerConeAngle": 0.0}, {"outerConeAngle": 2.0}, {"innerConeAngle": -0.1}])
 def test_a_spot_whose_cone_is_none_is_refused(cone: dict[str, float], file: Path, data: bytes) -> None:
-    file.write_bytes(with_header(data, lambda header: shone(header, cone, DOWN)))
+    file.write_bytes(change_header(data, lambda header: shone(header, cone, DOWN)))
     with pytest.raises(FileFormatError, match="ConeAngle"):
         load_description(f"{file}#crate")
 
@@ -197,7 +187,7 @@ def test_an_attack_on_a_node_is_verified_and_goes_on_from_its_file(file: Path, t
 def test_a_light_or_camera_out_of_reach_is_refused(
     node: int, change: dict[str, Any], words: str, file: Path, data: bytes
 ) -> None:
-    file.write_bytes(with_header(data, lambda header: header["nodes"][node].update(change)))
+    file.write_bytes(change_header(data, lambda header: header["nodes"][node].update(change)))
     with pytest.raises(InputError, match=words):
         load_description(f"{file}#crate")
 
