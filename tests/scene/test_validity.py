@@ -115,8 +115,11 @@ def photographed(height: float | None = None, radius: float | None = None, **sai
     lit = EnvironmentAsset("hall", np.ones((8, 16, 3), np.float32), photographed=True)
     loose = replace(load_object("mug"), metres=None)
     return load_description(
-        loose, lit, setting_values={name: one for name, one in given.items() if one is not None}, **said
-    )  # type: ignore[arg-type]
+        loose,
+        lit,
+        setting_values={name: one for name, one in given.items() if one is not None},
+        **said,  # type: ignore[arg-type]
+    )
 
 
 def test_a_photograph_fits_by_its_height_and_its_empty_floor() -> None:
