@@ -23,6 +23,7 @@ from stand_ins import interrupted
 SIZE = 32
 LABELS = ("mug", "vase")
 FAST: dict[str, Any] = {"resolution": (SIZE, SIZE), "steps": 6, "spp": 2, "trials": 6, "verify_spp": 4}
+REPEATED: dict[str, Any] = {**FAST, "deterministic": True, "baseline": False}
 
 
 class Brightness(nn.Module):
@@ -55,6 +56,13 @@ def level(scene: advsearch.Scene) -> float:
         return float(render(render.start, spp=64)[SIZE // 4 : -SIZE // 4, SIZE // 4 : -SIZE // 4].mean())
 
 
+@pytest.fixture(scope="module")
+def whole(scene: advsearch.Scene, level: float, tmp_path_factory: pytest.TempPathFactory) -> advsearch.AttackResult:
+    """A deterministic attack that nobody stopped."""
+    run = tmp_path_factory.mktemp("whole") / "run"
+    return advsearch.attack(scene, model(level + 0.03), run=run, **REPEATED)
+
+
 @pytest.mark.medium
 def test_a_weakness_is_found_verified_and_kept(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:
     result = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **FAST)
@@ -65,6 +73,7 @@ def test_a_weakness_is_found_verified_and_kept(scene: advsearch.Scene, level: fl
     assert summary.clean.control.correct == 6 and summary.clean.label == "mug"
     assert summary.adversarial.label == "vase" and summary.verified.labels == {"vase": 6}
     assert summary.renders["search"] == summary.baseline.renders
+    assert 0.0 < float((result.u - scene.renderer("texture", resolution=SIZE).start).abs().max()) <= 0.1 + 1e-6
     assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8")) == summary.to_dict()
     for name in ("clean.png", "clean.exr", "adversarial.png", "adversarial.exr", "difference.png", "search.gif"):
         assert (tmp_path / "run" / "images" / name).stat().st_size > 0, name
@@ -83,11 +92,10 @@ def test_what_cannot_be_found_is_not_claimed(scene: advsearch.Scene) -> None:
 
 
 @pytest.mark.medium
-def test_the_same_seed_gives_the_same_numbers_when_deterministic(scene: advsearch.Scene, level: float) -> None:
-    runs = [
-        advsearch.attack(scene, model(level + 0.03), deterministic=True, baseline=False, **FAST).u for _ in range(2)
-    ]
-    assert torch.equal(*runs)
+def test_the_same_seed_gives_the_same_numbers_when_deterministic(
+    whole: advsearch.AttackResult, scene: advsearch.Scene, level: float
+) -> None:
+    assert torch.equal(advsearch.attack(scene, model(level + 0.03), **REPEATED).u, whole.u)
 
 
 @pytest.mark.medium
@@ -114,17 +122,19 @@ def test_render_runs_in_ordinary_autograd(scene: advsearch.Scene, level: float) 
 
 @pytest.mark.medium
 def test_a_stopped_run_goes_on_where_it_was(
-    scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: advsearch.AttackResult,
+    scene: advsearch.Scene,
+    level: float,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    options = {**FAST, "deterministic": True, "baseline": False}
-    whole = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "whole", **options)
     with monkeypatch.context() as patch:
         interrupted(patch, 3)
-        stopped = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **options)
+        stopped = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **REPEATED)
     assert stopped.summary.ending == "interrupted" and can_resume(tmp_path / "run")
-    again = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", resume=True, **options)
+    again = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", resume=True, **REPEATED)
     assert torch.equal(again.u, whole.u) and again.summary.verified == whole.summary.verified
-    assert rows_of(tmp_path / "run") == rows_of(tmp_path / "whole")
+    assert whole.run is not None and rows_of(tmp_path / "run") == rows_of(whole.run)
     assert not can_resume(tmp_path / "run")
 
 

@@ -89,12 +89,8 @@ def test_what_is_stored_is_not_asked_of_workers(
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("control", ["projector", "shadow"])
-def test_light_is_searched_by_workers_and_goes_on(
-    control: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    options = {"resolution": 2} if control == "projector" else {}
-    settings = {**SMALL, "environment": "low-sun", "controls": {control: options}}
+def test_light_is_searched_by_workers_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {**SMALL, "environment": "low-sun", "controls": {"projector": {"resolution": 2}}}
     attack_once(AttackConfig(**settings, run=str(tmp_path / "alone")))
     config = AttackConfig(**settings, workers=2, run=str(tmp_path / "run"))
     shared(monkeypatch, settings)
@@ -121,9 +117,8 @@ def test_searches_side_by_side_have_the_rows_of_one_after_the_other(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("policy", ["cmaes", RESTARTS])
-def test_two_processes_have_the_rows_of_none(policy: Any, tmp_path: Path) -> None:
-    settings = {**SMALL, "policy": policy, "steps": 24}
+def test_two_processes_have_the_rows_of_none(tmp_path: Path) -> None:
+    settings = {**SMALL, "policy": RESTARTS, "steps": 24}
     attack_once(AttackConfig(**settings, run=str(tmp_path / "alone")))
     attack_once(AttackConfig(**settings, workers=2, run=str(tmp_path / "run")))
     assert rows(tmp_path / "run") == rows(tmp_path / "alone")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import pytest
@@ -18,7 +17,6 @@ from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.formation import ALL_OMISSIONS, NO_OMISSIONS
 from advsearch.scene.renderer import Renderer
-from covering import only
 
 SIZE = 40
 
@@ -28,9 +26,8 @@ def made(controls: Any, object: str = "mug", environment: str = "studio", denois
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("control", only(["texture"], ["texture", "haze"]))
-def test_nothing_that_is_left_out_changes_a_picture_or_a_gradient(control: str) -> None:
-    renderer = made(control)
+def test_nothing_that_is_left_out_changes_a_picture_or_a_gradient() -> None:
+    renderer = made("texture")
     loss, u = make_smooth_loss((SIZE, SIZE)), find_interior_point(renderer)
     full = renderer.copy_with(renderer.scene.copy_with(leave_out=NO_OMISSIONS))
     with torch.no_grad():
@@ -90,14 +87,13 @@ def test_dark_lamps_get_no_samples_and_change_nothing_but_noise() -> None:
 
 
 NUMBERS = ("roughness", "metallic", "specular", "clearcoat")
-ENDS = [dict(zip(NUMBERS, values, strict=True)) for values in product((0.0, 1.0), repeat=len(NUMBERS))]
-QUICK = [ENDS[int("".join(map(str, ends)), 2)] for ends in ((1, 1, 0, 0), (0, 0, 1, 1), (1, 0, 0, 1))]
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("ends", only(QUICK, ENDS), ids=lambda one: "".join(f"{end:g}" for end in one.values()))
-def test_a_material_looks_the_same_however_its_numbers_come_and_whatever_is_left_out(ends: dict[str, float]) -> None:
+@pytest.mark.parametrize("values", [(1.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.0)])
+def test_a_material_looks_the_same_however_its_numbers_come_and_whatever_is_left_out(values: Any) -> None:
     """Fixed, searched, and searched from the other ends, at both ends of every number."""
+    ends = dict(zip(NUMBERS, values, strict=True))
     searched = MaterialControl(**{name: [0.0, 1.0] for name in NUMBERS})
     other = {name: 1.0 - value for name, value in ends.items()}
     pictures = []

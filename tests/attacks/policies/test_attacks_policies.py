@@ -286,7 +286,7 @@ def domain_for(policy: Policy[Any]) -> Domain:
     return FEW if policy.name == "grid" else MIXED
 
 
-def classifier(d: int = 18, objective: str = "margin", nan_at: int = -1, cost: int = 0) -> Evaluate:
+def classifier(d: int = 18, objective: str = "margin", nan_at: int = -1) -> Evaluate:
     """A small random network of u with four classes, seen through noise, as an `evaluate`."""
     rng = seeded(1, 1)
     first, second = torch.randn(d, 12, generator=rng), torch.randn(12, 4, generator=rng)
@@ -300,8 +300,7 @@ def classifier(d: int = 18, objective: str = "margin", nan_at: int = -1, cost: i
         if slope is not None and query.number % 3 == 1:
             slope[query.number % d] = math.nan
         number = math.nan if query.number == nan_at else float(value.detach())
-        price = query.samples * (1 + cost * (query.gradient is True))
-        return Evaluation(number, slope, bool(logits.argmax() % 2), cost=price)
+        return Evaluation(number, slope, bool(logits.argmax() % 2), cost=query.samples)
 
     return partial(map, evaluate)
 
