@@ -1,4 +1,4 @@
-"""What a researcher guesses in Python: arrays for u, classes for instances, a function for a task, losses at hand."""
+"""What a researcher guesses in Python: arrays for u, and a function for a task."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Python interface as a person meets it: names, signatures, short texts, tables."""
+"""The Python interface as a person meets it: keywords, tables, and models without a gradient."""
 
 from __future__ import annotations
 

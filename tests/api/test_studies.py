@@ -1,5 +1,4 @@
-"""Curves, gaps and regions: their accounting with stand-ins for attacks, and one small region and one search over
-conditions that are rendered."""
+"""Curves and regions: their accounting with stand-ins for attacks, and one small region that is rendered."""
 
 from __future__ import annotations
 

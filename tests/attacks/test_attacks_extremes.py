@@ -1,4 +1,4 @@
-"""Policies and objectives at the ends of arithmetic: huge logits, ties, NaN, noise without a variance, many steps."""
+"""Policies and objectives at the ends of arithmetic: huge logits, ties, random predictions, and any unit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`advsearch completion`: what Tab offers in bash, and that zsh reads its script."""
+"""`advsearch completion`: what Tab offers in bash."""
 
 from __future__ import annotations
 

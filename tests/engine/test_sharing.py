@@ -1,4 +1,4 @@
-"""One way to answer: queries by workers, the journal, and the page that names the functions on the way."""
+"""One way to answer: queries by workers, and the journal."""
 
 from __future__ import annotations
 

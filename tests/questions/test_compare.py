@@ -1,4 +1,4 @@
-"""`compare` on stored sweeps, without a renderer, and once from the command line to the pictures."""
+"""`compare` on stored sweeps, without a renderer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stability suite: every extreme has a case, the cheap ones hold, and the command reports honestly."""
+"""The stability suite: its cases hold, the command reports honestly, and it goes on where it was stopped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows as tables for other programs, and the list of runs."""
+"""Exports: written by the name of the file, to no link, and of a run whose disk was full."""
 
 from __future__ import annotations
 

@@ -316,8 +316,8 @@ def test_what_is_wrong_with_references_is_said_in_a_sentence(folder: Path, model
         return str(error.value)
 
     assert "(No such file or directory); check the path" in said(tmp_path / "none")
-    (tmp_path / "empty" / "bowl").mkdir()
-    assert "expected pictures of bowl" in said(tmp_path / "empty")
+    (tmp_path / "empty" / "bowl").mkdir(parents=True)
+    assert "got only bowl" in said(tmp_path / "empty")
     (folder / "red" / "notes.txt").write_text("no picture")
     assert "notes.txt: expected a picture file such as PNG" in said(folder)
     (folder / "red" / "notes.txt").unlink()

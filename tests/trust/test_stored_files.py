@@ -88,7 +88,7 @@ def test_a_file_that_waits_is_refused(tmp_path: Path, monkeypatch: pytest.Monkey
             return None  # type: ignore[return-value]
 
     monkeypatch.setattr(stored_files, "open_regular", lambda *_: Waiting())
-    with pytest.raises(FileFormatError, match="a"):
+    with pytest.raises(FileFormatError, match="a label file"):
         stored_files.read_bytes(tmp_path / "a", "a label file", 100)
 
 

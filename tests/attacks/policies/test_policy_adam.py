@@ -1,4 +1,4 @@
-"""The policy `adam`: steps in units of half a range, whatever the gradient's size, and what it does without one."""
+"""The policy `adam`: steps in units of half a range, whatever the gradient's size."""
 
 from __future__ import annotations
 

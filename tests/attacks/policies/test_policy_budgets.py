@@ -1,4 +1,4 @@
-"""What the policies state about themselves is true: budgets to a known optimum, the page about them, its example."""
+"""What the policies state about themselves is true: budgets to a known optimum, and the example of their page."""
 
 from __future__ import annotations
 

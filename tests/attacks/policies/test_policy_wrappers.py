@@ -1,4 +1,4 @@
-"""What wraps policies: races, `restarts`, `portfolio`, discrete choices, and how they are named."""
+"""What wraps policies: rounds of a race, `restarts` and discrete choices."""
 
 from __future__ import annotations
 
