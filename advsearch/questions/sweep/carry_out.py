@@ -77,6 +77,7 @@ SCENE_SETTINGS = (
     "camera",
     "things",
     "backdrop",
+    "occluder",
     "set_",
     "exposure",
 )
