@@ -29,7 +29,11 @@ from advsearch.options import describe_value, format_things
 from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Float32Array, ObjectAsset
-from advsearch.scene.backdrop import BackdropPhotograph, fit_to_photograph
+from advsearch.scene.backdrop import (
+    BackdropPhotograph,
+    find_light_beside,
+    fit_to_photograph,
+)
 from advsearch.scene.camera_model import make_bundled_models, make_pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
@@ -269,7 +273,8 @@ def load_scene(
             180}; `size` (metres), `name` and `label` are optional.
         backdrop: a photograph that the scene is rendered into (docs/cameras.md): a
             picture file, taken by `camera`; of a part of it,
-            ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels.
+            ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels. By default it is lit by the .hdr
+            or .exr file of its name beside it, if there is one.
         occluder: a mask of the photograph's size, white where it shows what is before
             the object.
 
@@ -286,6 +291,8 @@ def load_scene(
     if scene is not None and mitsuba_dict is None:
         object_spec = f"{scene}#{object}"
     fixed_values = None if settings is None else to_python(settings)
+    if environment is None:
+        environment = find_light_beside(backdrop)
     description = load_description(
         object_spec,
         environment,
