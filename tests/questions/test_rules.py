@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import fisher_exact
 
 from advsearch.questions.explain.clusters import find_clusters
-from advsearch.questions.explain.envelope import find_envelope, list_factor_peels
+from advsearch.questions.explain.envelope import find_envelope
 from advsearch.questions.explain.importance import find_importance
 from advsearch.rules import (
     CountedRule,

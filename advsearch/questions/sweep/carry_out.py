@@ -76,6 +76,8 @@ SCENE_SETTINGS = (
     "unit",
     "camera",
     "things",
+    "backdrop",
+    "occluder",
     "set_",
     "exposure",
 )
