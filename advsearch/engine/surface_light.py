@@ -97,6 +97,7 @@ class SurfaceLight(PredictedSearch):
     """
 
     method: ClassVar[str] = "surface light"
+    title: ClassVar[str] = "finding the light on surfaces"
     light_u: Tensor | None = None
     moving_coordinates: Tensor | None = None
     _renderer: SurfaceRenderer | None = None

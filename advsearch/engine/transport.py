@@ -113,6 +113,8 @@ class PredictedSearch(ABC):
 
     Attributes:
         method: method, for reports.
+        title: what its preparation does, for the progress.
+        what_it_renders: what the search renders afterwards, for the progress.
         is_exact: whether equal configurations have equal objectives.
         problem: of the searches.
         steps: evaluations of a search; those after them belong to the ranking, and are
@@ -129,6 +131,8 @@ class PredictedSearch(ABC):
     """
 
     method: ClassVar[str] = "matrix"
+    title: ClassVar[str] = "collecting light transport"
+    what_it_renders: ClassVar[str] = "renders nothing"
     is_exact: ClassVar[bool] = False
 
     problem: Problem

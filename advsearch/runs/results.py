@@ -603,7 +603,8 @@ class PredictionError(Fields):
     """How far predicted pictures were from traced ones, at the last comparison."""
 
     levels: JsonFloat = Field(
-        description="of 255, over the object's pixels, root mean square"
+        description="of 255, over the object's pixels (of a crop, over those outside), "
+        "root mean square"
     )
     logits: JsonFloat = Field(
         description="of the margin, the mean over the pictures that were compared"
@@ -630,12 +631,14 @@ class LinearTransport(Fields):
 
     used: bool
     way: str | None = optional(
-        "by what: `matrix`, `basis pictures` (of a sweep), or `surface light`"
+        "by what: `matrix`, `basis pictures` (of a sweep), `surface light`, or `crop`, "
+        "which renders a part of each picture"
     )
     reason: str | None = optional(
         "why pictures were rendered, all or from some evaluation on, or not predicted "
         "by surface light"
     )
+    crop: str | None = optional("why whole pictures were rendered")
     conditions: BankOfConditions | None = optional("with `over`")
     entries: int | None = optional("of the matrix")
     bytes: int | None = optional("of its memory")

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +46,7 @@ from advsearch.scene.gradients import (
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.rig import Mount
+from advsearch.scene.window import Window
 
 MAX_SPP = 65536
 # a point of the unit box
@@ -92,6 +93,14 @@ class InputSpace(InputMapping, Protocol):
         """
 
 
+class Crop(NamedTuple):
+    """A part of the image that is rendered, and what the rest of it shows."""
+
+    window: Window  # of the pixels that are rendered
+    # radiance (H, W, 3), or (H, W, 4) with coverage where there is a backdrop
+    surroundings: Tensor
+
+
 # largest group for which it is measured how far its coordinates move outlines
 MAX_MEASURED_SIZE = 64
 # fraction of the noise over which the tone curve is straight; see `Renderer.halves`
@@ -106,6 +115,7 @@ class Renderer:
         plan: how each coordinate is differentiated; may be replaced.
         routes: which scene inputs each group of coordinates reaches, by
             `control.parameter`.
+        crop: what is rendered of each image; None for all of it.
         renders: number of primal renders so far, those of differences included.
         gradients: number of adjoint renders so far.
         non_finite: number of pixels and gradient entries that were NaN or infinite and
@@ -141,6 +151,7 @@ class Renderer:
         self._shape = space.start.shape
         self._source: Source | None = None
         self._predict: Predict | None = None
+        self.crop: Crop | None = None
         self.renders = self.gradients = self.non_finite = 0
         self._left_out: frozenset[str] = frozenset()
         groups = space.groups
@@ -186,6 +197,7 @@ class Renderer:
         *,
         source: Source | None = None,
         predict: Predict | None = None,
+        crop: Crop | None = None,
         **formation: Any,
     ) -> Renderer:
         """Return a renderer of the same space with some changes.
@@ -198,6 +210,7 @@ class Renderer:
             predict: predicts radiance (`scene.predictor`). Seed and samples of a call
                 mean nothing then, and every derivative runs back through scene inputs,
                 whatever the plan is.
+            crop: what is rendered of each image.
             formation: other fields of the image formation.
         """
         other = copy.copy(self)
@@ -205,6 +218,7 @@ class Renderer:
         other.scene = scene or self.scene
         other._source = source or self._source
         other._predict = predict or self._predict
+        other.crop = crop or self.crop
         return other
 
     def __call__(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
@@ -267,7 +281,7 @@ class Renderer:
         """
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
-            halves, mean = self._trace_halves(inputs, seed, spp)
+            halves, mean = self.trace_halves(inputs, seed, spp)
 
             def finish(radiance: Tensor) -> Tensor:
                 return self.finish_image(radiance, inputs, u, display=False)
@@ -287,11 +301,16 @@ class Renderer:
             second = display_straight(halves[1])
             return first, second, self.space.apply_to_image(u, curve_point)
 
-    def _trace_halves(
+    def trace_halves(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
     ) -> tuple[list[Tensor], Tensor]:
-        """Trace two renders with independent noise; return them and the denoised
-        mean.
+        """Trace the radiance of scene inputs twice, with independent noise.
+
+        Arguments as for a call. Nothing is counted.
+
+        Returns:
+            Both, which are not denoised, and their mean, which is: (H, W, 3), or
+            (H, W, 4) with coverage where there is a backdrop.
         """
         hide = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
@@ -582,6 +601,8 @@ class Renderer:
         radiance: Tensor = _Radiance.apply(  # type: ignore[no-untyped-call]
             self, tuple(inputs), seed, spp, hide_environment, denoised, *inputs.values()
         )
+        if self.crop is not None:
+            return self.crop.window.paste(radiance, self.crop.surroundings)
         return radiance
 
     def replace_non_finite(self, values: Tensor) -> Tensor:
@@ -729,6 +750,7 @@ class _Radiance(torch.autograd.Function):
         ctx.seed = seed
         ctx.spp = spp
         ctx.hide = hide
+        ctx.window = renderer.crop.window if renderer.crop else None
         ctx.save_for_backward(*tensors)
         inputs = dict(zip(names, tensors, strict=True))
         noise_seed = seeds.stream(renderer.root_seed, "primal", seed)
@@ -740,7 +762,10 @@ class _Radiance(torch.autograd.Function):
             if denoised and renderer.formation.denoiser == "oidn":
                 guide_seed = seeds.stream(renderer.root_seed, "guides", seed)
                 image_seeds["guides"] = guide_seed
-            rendered, *guides = renderer.scene.render_images(inputs, image_seeds, spp)
+            with renderer.scene.limit_window(ctx.window):
+                rendered, *guides = renderer.scene.render_images(
+                    inputs, image_seeds, spp
+                )
         rendered = renderer.replace_non_finite(rendered)
         for guide in guides:
             clean = denoise(
@@ -781,9 +806,10 @@ class _Radiance(torch.autograd.Function):
                 )
             else:
                 method = "hidden" if ctx.hide else "path"
-                gradients = renderer.scene.render_adjoint(
-                    inputs, cotangent, noise_seed, ctx.spp, wrt=wrt, method=method
-                )
+                with renderer.scene.limit_window(ctx.window):
+                    gradients = renderer.scene.render_adjoint(
+                        inputs, cotangent, noise_seed, ctx.spp, wrt=wrt, method=method
+                    )
             renderer.gradients += 1
             for name, gradient in gradients.items():
                 by_input[name] = renderer.replace_non_finite(gradient)

@@ -498,9 +498,11 @@ def transport_text(summary: AttackSummary) -> str:
     if not transport.used:
         text = "every picture was rendered"
         return f"{text}: {transport.reason}" if transport.reason else text
-    predictor = "light on surfaces" if transport.way == "surface light" else "a matrix"
     n_predicted = count(summary.renders.get("products"), "picture")
+    predictor = "light on surfaces" if transport.way == "surface light" else "a matrix"
     parts = [f"{predictor} predicted {n_predicted}"]
+    if transport.way == "crop":
+        parts = ["only the part of each picture was rendered that can change"]
     if transport.error is not None:
         parts.append(
             "at the last comparison with a traced one it was off by "

@@ -51,6 +51,7 @@ from advsearch.scene.mitsuba_backend.variant import (
 )
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_TYPE
 from advsearch.scene.parts import PATTERN_SUFFIX, Lamp, LampGlass, iterate_plugins
+from advsearch.scene.window import Window
 
 MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
 NO_ROULETTE_DEPTH = 1000
@@ -79,6 +80,7 @@ class MitsubaScene:
         roulette_depth: segments of a light path after which Russian roulette starts.
         declared_inputs: for each input its key in `parameters`, and its definition.
         interior_inputs: the inputs that the interior adjoint differentiates correctly.
+        window: the window of the image that is rendered; None for all of it.
 
     Args:
         description: the scene.
@@ -117,6 +119,7 @@ class MitsubaScene:
             self.sampler = sampler
             self.assembly = Assembly(description)
             self.max_depth = self.depth = max_depth
+            self.window: Window | None = None
             self._leave_out = frozenset(leave_out)
             # Dr.Jit can record neither of these
             unrecorded = description.thin_lens or any(
@@ -260,6 +263,37 @@ class MitsubaScene:
         finally:
             self.depth = depth_before
 
+    @contextmanager
+    def limit_window(self, window: Window | None) -> Iterator[None]:
+        """Render a window of the image alone inside the `with`, if it is not None."""
+        window_before = self.window
+        self.window = window
+        try:
+            yield
+        finally:
+            self.window = window_before
+
+    @contextmanager
+    def _crop_film(self) -> Iterator[None]:
+        """Crop the camera's film to the window inside the `with`."""
+        if self.window is None:
+            yield
+            return
+        self._write_crop(self.window)
+        try:
+            yield
+        finally:
+            self._write_crop(Window(0, 0, *self.resolution))
+
+    def _write_crop(self, window: Window) -> None:
+        """Set which window of the image the camera's film has."""
+        film = "camera.film"
+        size = mi.ScalarVector2u(window.width, window.height)
+        self.parameters[f"{film}.crop_size"] = size
+        offset = mi.ScalarPoint2u(window.left, window.top)
+        self.parameters[f"{film}.crop_offset"] = offset
+        self.parameters.update()
+
     def round_sample_count(self, samples: float, sampler: str | None = None) -> int:
         """Return how many samples the sampler takes when at least `samples` are needed.
 
@@ -293,12 +327,12 @@ class MitsubaScene:
             spp: samples per pixel.
 
         Returns:
-            For each of `seeds` (H, W, 3) float32; of a scene with a backdrop (H, W, 4)
-            with the coverage of its surfaces; of "guides" (H, W, 6), the first hit's
-            albedo in [0, 1] and its shading normal.
+            For each of `seeds` (H, W, 3) float32, of the window if there is one; of a
+            scene with a backdrop (H, W, 4) with the coverage of its surfaces; of
+            "guides" (H, W, 6), the first hit's albedo in [0, 1] and its shading normal.
         """
         INTERRUPTS.look()
-        with mitsuba_lock:
+        with mitsuba_lock, self._crop_film():
 
             def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
                 image = integrator.render(
@@ -325,7 +359,7 @@ class MitsubaScene:
             ):
                 function: Callable[..., Any] = render
                 if self._freeze:
-                    key = (method, spp, self.depth)
+                    key = (method, spp, self.depth, self.window)
                     function = self._recorded.get_or_record(key, render, media)
                 drjit_image = function(
                     self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)
@@ -410,7 +444,7 @@ class MitsubaScene:
 
         Args:
             inputs: as in `radiance`.
-            cotangent: (H, W, 3) float32.
+            cotangent: (H, W, 3) float32, of the window if there is one.
             seed: should differ from the primal's, or the gradient of a noisy image is
                 returned.
             spp: independent samples per pixel.
@@ -441,7 +475,7 @@ class MitsubaScene:
                 image_gradient = torch.cat([image_gradient, no_coverage], dim=-1)
             self._set(inputs)
             names = (*sorted(extra - set(requested)), *requested)
-            with self._tracked(names, inputs) as tracked:
+            with self._tracked(names, inputs) as tracked, self._crop_film():
                 self._integrator(method).render_backward(
                     self._scene,
                     self.parameters,
