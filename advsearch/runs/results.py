@@ -639,6 +639,9 @@ class LinearTransport(Fields):
         "by surface light"
     )
     crop: str | None = optional("why whole pictures were rendered")
+    window: tuple[int, int, int, int] | None = optional(
+        "the part of the picture that was traced: top, left, height and width"
+    )
     conditions: BankOfConditions | None = optional("with `over`")
     entries: int | None = optional("of the matrix")
     bytes: int | None = optional("of its memory")

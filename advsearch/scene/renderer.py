@@ -221,6 +221,19 @@ class Renderer:
         other.crop = crop or self.crop
         return other
 
+    def crop_to(self, window: Window, u: Tensor, seed: int, spp: int) -> Renderer:
+        """Return a renderer that renders a window alone.
+
+        The rest of its images is that of u (d,), which is rendered now: arguments as
+        for a call. It does not count as a render.
+        """
+        with torch.no_grad():
+            inputs = self.scene.assembly(self.space.inputs(u))
+            surroundings = self.copy_with().render_radiance(
+                _select_scene_inputs(inputs), seed, spp, "backdrop.color" in inputs
+            )
+        return self.copy_with(crop=Crop(window, surroundings))
+
     def __call__(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
         """Render one or several configurations as the model would see them.
 
@@ -314,6 +327,7 @@ class Renderer:
         """
         hide = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
+        window = self.crop.window if self.crop else None
         undenoised = self.copy_with(denoiser="none")
         noise_seeds = [seeds.stream(seed, "traced", half) for half in range(2)]
         halves = [
@@ -322,8 +336,12 @@ class Renderer:
         ]
         mean = (halves[0] + halves[1]) / 2.0
         guide_seed = seeds.stream(self.root_seed, "guides", noise_seeds[0])
-        albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
-        clean = denoise(mean[..., :3].contiguous(), albedo, normal)
+        with self.scene.limit_window(window):
+            albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
+        traced = mean[..., :3] if window is None else window.select(mean)[..., :3]
+        clean = denoise(traced.contiguous(), albedo, normal)
+        if self.crop is not None:
+            clean = self.crop.window.paste(clean, self.crop.surroundings[..., :3])
         return halves, torch.cat([clean, mean[..., 3:]], dim=-1)
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 
 class Window(NamedTuple):
@@ -54,6 +55,15 @@ class Window(NamedTuple):
         pasted = image.clone()
         self.select(pasted)[...] = pixels
         return pasted
+
+    def pad(self, pixels: Tensor, resolution: tuple[int, int]) -> Tensor:
+        """Return an image (H, W, c) that is zero outside of the window.
+
+        It is differentiable with respect to the window's pixels (h, w, c).
+        """
+        bottom = resolution[0] - self.top - self.height
+        right = resolution[1] - self.left - self.width
+        return functional.pad(pixels, (0, 0, self.left, right, self.top, bottom))
 
     def is_outside(self, resolution: tuple[int, int]) -> Tensor:
         """Return which pixels of an image are outside of the window, (H, W) bool."""

@@ -34,7 +34,7 @@ from advsearch.attacks.candidates import (
 from advsearch.attacks.evaluation import Query
 from advsearch.engine import surface_light
 from advsearch.engine.bank import Bank
-from advsearch.engine.crop import CroppedSearch, find_crop_refusal
+from advsearch.engine.crop import CroppedSearch
 from advsearch.engine.gradients import planning
 from advsearch.engine.gradients.bench import Bench, find_interior_point
 from advsearch.engine.journal import PLAN_NOTE, Journal
@@ -50,6 +50,7 @@ from advsearch.engine.transport import (
     make_rendering_remark,
 )
 from advsearch.engine.verifier import Verifier
+from advsearch.engine.windows import find_crop_refusal
 from advsearch.progress import Stages
 from advsearch.questions.attack.ambient import find_ambient
 from advsearch.report.wording import count

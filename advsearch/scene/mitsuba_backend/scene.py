@@ -273,6 +273,13 @@ class MitsubaScene:
         finally:
             self.window = window_before
 
+    @property
+    def window_size(self) -> tuple[int, int]:
+        """Height and width of what is rendered, in pixels."""
+        if self.window is None:
+            return self.resolution
+        return self.window.height, self.window.width
+
     @contextmanager
     def _crop_film(self) -> Iterator[None]:
         """Crop the camera's film to the window inside the `with`."""
@@ -578,13 +585,13 @@ class MitsubaScene:
         Their vertices have the change of their pixel for a unit more of the input, and
         the paths have an image. Other arguments as for `pictures`.
         """
-        with mitsuba_lock:
+        with mitsuba_lock, self._crop_film():
             self._set(inputs)
             key = self.declared_inputs[name][0]
             spp = self.round_sample_count(spp)
             noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
             noise.set_samples_per_wavefront(spp)
-            height, width = self.resolution
+            height, width = self.window_size
             noise.seed(dr.opaque(mi.UInt32, seed), height * width * spp)
             part = name.partition(".")[0]
             projector = None
@@ -596,7 +603,7 @@ class MitsubaScene:
                 self.parameters,
                 key,
                 noise,
-                self.resolution,
+                self.window_size,
                 self.depth,
                 spp,
                 projector,

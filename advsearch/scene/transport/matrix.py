@@ -493,8 +493,12 @@ class LinearRenderer(Predictor):
     def predict_radiance(self, inputs: Inputs) -> Tensor:
         base = self.collected.base_image()
         radiance = base[..., :3]
+        crop = self.path_renderer.crop
         for name, transport in self.collected.transports.items():
-            radiance = radiance + transport(inputs[name] - self.linearized_at[name])
+            change = transport(inputs[name] - self.linearized_at[name])
+            if crop is not None:
+                change = crop.window.pad(change, base.shape[:2])
+            radiance = radiance + change
         if base.shape[-1] == 3:
             return radiance
         return torch.cat([radiance, base[..., 3:]], dim=-1)
@@ -531,7 +535,7 @@ def _collect(
     }
     transports = {
         name: TextureTransport(
-            renderer.formation.resolution,
+            _traced_size(renderer),
             (value.shape[0], value.shape[1]),
             small=quick,
         )
@@ -542,7 +546,9 @@ def _collect(
         base = renderer.render_radiance(traced, seed, spp, hide)
         tick(spp)
     else:
-        paths = _fill_transports(renderer, transports, traced, seed, tick, spp)
+        window = renderer.crop.window if renderer.crop else None
+        with renderer.scene.limit_window(window):
+            paths = _fill_transports(renderer, transports, traced, seed, tick, spp)
         radiance = paths.radiance - paths.background if hide else paths.radiance
         radiance = renderer.replace_non_finite(radiance)
         base, smooth = _make_smooth(renderer, radiance, paths, quick)
@@ -550,6 +556,8 @@ def _collect(
             transport.finish(smooth)
         if hide:
             base = torch.cat([base, paths.coverage], dim=-1)
+        if renderer.crop is not None:
+            base = renderer.crop.window.paste(base, renderer.crop.surroundings)
     return LinearizedScene(
         transports=transports,
         linearized_at=linearized_at,
@@ -569,7 +577,7 @@ def _fill_transports(
 ) -> Paths:
     """Trace paths for each matrix and add them; return the mean images of all."""
     samples, n_passes = plan_passes(renderer, spp)
-    height, width = renderer.formation.resolution
+    height, width = _traced_size(renderer)
     images: list[Paths] = []
     for name, transport in transports.items():
         for index in range(n_passes):
@@ -617,8 +625,15 @@ def find_linear_inputs(renderer: Renderer) -> frozenset[str]:
     )
 
 
+def _traced_size(renderer: Renderer) -> tuple[int, int]:
+    """Return height and width of what is traced of an image, in pixels."""
+    if renderer.crop is None:
+        return renderer.formation.resolution
+    return renderer.crop.window.height, renderer.crop.window.width
+
+
 def plan_passes(renderer: Renderer, spp: int) -> tuple[int, int]:
     """Return the samples per pixel of a pass, and the number of passes."""
-    height, width = renderer.formation.resolution
+    height, width = _traced_size(renderer)
     samples = max(1, min(spp, SAMPLES_PER_PASS // (height * width)))
     return samples, -(-spp // samples)
