@@ -32,7 +32,8 @@ from hostile import HOSTILE, shown
 
 WRONG: dict[str, Any] = {
     "object": "", "path": "", "shutter": 0.0, "rolling": -61.0, "environment": [], "up": "x", "size": 0, "things": 3,
-    "judge": "", "backdrop": "", "occluder": "", "unit": "ft", "facing": "ahead", "camera": "", "set_": {"camera.azimuth": math.nan}, "exposure": 99,
+    "judge": "", "backdrop": "", "occluder": "", "unit": "ft",
+    "facing": "ahead", "camera": "", "set_": {"camera.azimuth": math.nan}, "exposure": 99,
     "resolution": "4x4", "model": "a\x00b", "labels": ["tench, Tinca tinca", "goldfish"],
     "prompt": "a photo of a {} | ", "value_range": "255,0", "ask": {"calls": "many"}, "task": "  ", "label": "  ",
     "controls": {"texture": 3}, "epsilon": "nan", "seconds": 0, "target": [3.5], "minimise": "maybe", "smallest": 2,

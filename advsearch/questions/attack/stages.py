@@ -34,6 +34,7 @@ from advsearch.attacks.candidates import (
 from advsearch.attacks.evaluation import Query
 from advsearch.engine import surface_light
 from advsearch.engine.bank import Bank
+from advsearch.engine.crop import CroppedSearch
 from advsearch.engine.gradients import planning
 from advsearch.engine.gradients.bench import Bench, find_interior_point
 from advsearch.engine.journal import PLAN_NOTE, Journal
@@ -49,6 +50,7 @@ from advsearch.engine.transport import (
     make_rendering_remark,
 )
 from advsearch.engine.verifier import Verifier
+from advsearch.engine.windows import find_crop_refusal
 from advsearch.progress import Stages
 from advsearch.questions.attack.ambient import find_ambient
 from advsearch.report.wording import format_count
@@ -282,8 +284,7 @@ def choose_predictor(
         if refusal is None:
             return predictor
         if refusal.cause is RefusalCause.TOO_LARGE:
-            _report_rendering(refusal, stages, findings)
-            return None
+            return _crop_search(problem, refusal, stages, findings)
         # Only light on surfaces is refused for its accuracy.
         surface_refusal = refusal
         findings.surface_light_refusal = refusal
@@ -297,24 +298,39 @@ def choose_predictor(
         not findings.surface_light_refusal
         and find_matrix_refusal(problem, None, specialise) is None
     )
-    if is_too_short or surface_refusal.cause is RefusalCause.NO_CAMERA:
-        _report_rendering(matrix_refusal, stages, findings)
-    else:
-        _report_rendering(surface_refusal, stages, findings)
+    is_about_matrices = is_too_short or surface_refusal.cause is RefusalCause.NO_CAMERA
+    refusal = matrix_refusal if is_about_matrices else surface_refusal
+    if not specialise:
+        _report_rendering(refusal, stages, findings)
+        return None
+    return _crop_search(problem, refusal, stages, findings)
+
+
+def _crop_search(
+    problem: Problem, refusal: Refusal, stages: Stages, findings: RunState
+) -> PredictedSearch | None:
+    """Prepare and return the crop of a search whose images are not predicted.
+
+    None if whole images are rendered. `refusal` is why nothing predicts them.
+    """
+    findings.crop_refusal = find_crop_refusal(problem)
+    if findings.crop_refusal is None:
+        crop = CroppedSearch(problem, problem.steps)
+        findings.crop_refusal = _prepare(crop, stages)
+        if findings.crop_refusal is None:
+            findings.predictor_refusal = refusal
+            return crop
+    _report_rendering(refusal, stages, findings)
     return None
 
 
 def _prepare(predictor: PredictedSearch, stages: Stages) -> Refusal | None:
     """Prepare a predictor, and return why it cannot be used; None if it can."""
-    is_light = isinstance(predictor, SurfaceLight)
-    title = (
-        "finding the light on surfaces" if is_light else "collecting light transport"
-    )
     hint = (
-        "from here on the search renders nothing (counted in samples a pixel); "
-        "`specialise=false` leaves it out"
+        f"from here on the search {predictor.what_it_renders} (counted in samples a "
+        "pixel); `specialise=false` leaves it out"
     )
-    stages.begin("transport", title, predictor.n_samples, hint=hint)
+    stages.begin("transport", predictor.title, predictor.n_samples, hint=hint)
     try:
         predictor.prepare(stages.progress.advance)
     except TransportTooLargeError as error:
@@ -364,7 +380,8 @@ class Searches:
         n_renders = count_planned_renders(steps, max_extra_repeats=self.close_looks)
         samples = format_count(self.problem.spp, "sample")
         hint = f"{n_renders} pictures of {samples} a pixel; {shorter}"
-        if self.findings.predictor is not None:
+        predictor = self.findings.predictor
+        if predictor is not None and predictor.count_predicted("search", steps):
             n_traced = n_renders - steps
             hint = f"{steps} pictures predicted and {n_traced} traced; {shorter}"
         self.stages.begin(name, title, n_renders, hint=hint, at_most=True)

@@ -509,6 +509,8 @@ def transport_text(summary: AttackSummary) -> str:
     predictor = "light on surfaces" if transport.way == "surface light" else "a matrix"
     n_predicted = format_count(summary.renders.get("products"), "picture")
     parts = [f"{predictor} predicted {n_predicted}"]
+    if transport.way == "crop":
+        parts = ["only the part of each picture was rendered that can change"]
     if transport.error is not None:
         parts.append(
             "at the last comparison with a traced one it was off by "
