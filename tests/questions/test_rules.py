@@ -12,6 +12,7 @@ from advsearch.questions.explain.envelope import find_envelope, list_factor_peel
 from advsearch.questions.explain.importance import find_importance
 from advsearch.rules import (
     CountedRule,
+    RuleCondition,
     estimate_interval,
     find_covered,
     find_rules,
