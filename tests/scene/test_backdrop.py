@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,21 +33,21 @@ NO_SHADOW = {"ground.size": 0.0}
 AS_RENDERED = {"backdrop.noise": 0.0, "backdrop.blur": 0.0}
 
 
-def write_photograph(path: Path, size: tuple[int, int] = SIZE, **save: object) -> np.ndarray:
+def write_photograph(path: Path, size: tuple[int, int] = SIZE, **save: Any) -> np.ndarray:
     levels = np.random.default_rng(3).integers(0, 256, (*size, 3), dtype=np.uint8)
     Image.fromarray(levels).save(path, **save)
-    return levels
+    return np.asarray(levels)
 
 
 def decode(levels: np.ndarray) -> np.ndarray:
     """IEC 61966-2-1, written out once more in float64."""
     display = levels.astype(np.float64) / 255.0
-    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+    return np.asarray(np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4))
 
 
 def encode(linear: np.ndarray) -> np.ndarray:
     clipped = np.clip(linear, 0.0, 1.0)
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+    return np.asarray(np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055))
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +154,7 @@ def test_the_ground_is_darker_below_the_object_and_as_it_was_far_away(tmp_path: 
 @pytest.mark.parametrize("control", ["light.power", "texture"])
 def test_the_derivative_with_a_shadow_is_that_of_differences(tmp_path: Path, control: str) -> None:
     Image.new("RGB", (32, 32), (120, 160, 90)).save(tmp_path / "a.png")
-    controls: dict[str, object] = {
+    controls: dict[str, Any] = {
         "light.power": {"light": {"power": [0.2, 2.0]}},
         "texture": {"texture": {"resolution": 2}},
     }
