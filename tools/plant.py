@@ -137,8 +137,8 @@ FAULTS = (
     Fault(
         "models: a limit is not applied",
         "advsearch/trust/archives.py",
-        "if unpacked > scaled(LARGEST_RATIO) * size + SLACK:",
-        "if unpacked > scaled(LARGEST):",
+        "elif unpacked > scale_limit(LARGEST_RATIO) * size + SLACK:",
+        "elif unpacked > scale_limit(LARGEST):",
         ("tests/models/test_hostile_models.py",),
     ),
     Fault(
@@ -244,8 +244,8 @@ FAULTS = (
     Fault(
         "runs: an export has no metrics",
         "advsearch/runs/export.py",
-        "return [*OWN, *metrics, *values, *AFTER]",
-        "return [*OWN, *values, *AFTER]",
+        "return [*LEADING_COLUMNS, *metrics, *values, *TRAILING_COLUMNS]",
+        "return [*LEADING_COLUMNS, *values, *TRAILING_COLUMNS]",
         ("tests/runs/test_runs.py",),
     ),
     Fault(
@@ -266,7 +266,7 @@ FAULTS = (
     Fault(
         "viewer: any name leads to the server",
         "advsearch/trust/pages.py",
-        "if not _is_own(host, named, port, token):",
+        "if not _is_server_address(host, named, port, token):",
         "if not host:",
         ("tests/viewer/test_server.py",),
     ),
