@@ -75,7 +75,7 @@ def test_the_derivative_is_that_of_the_picture_and_that_of_what_was_asked_for(sc
         return seen(logits, images, labels) * (1.0 + 0.1 * configuration["pose.yaw"]) + own
 
     made = problem(scene, seen, controls={"texture": {"resolution": 8}, "pose": {"yaw": [-20, 30]}})
-    u = made.domain.begin
+    u = made.domain.initial_point
     picture = made.evaluate(Query(u, 3, phase="search", gradient=True))
     made.objective = get_objective(asks, made.task)
     found = made.evaluate(Query(u, 3, phase="search", gradient=True))
@@ -94,4 +94,4 @@ def test_the_derivative_is_that_of_the_picture_and_that_of_what_was_asked_for(sc
     expected = at.grad + (1.0 + 0.1 * float(yaw.detach())) * picture.gradient
     assert found.objective == pytest.approx(float(value.detach()), rel=1e-5)
     assert torch.allclose(found.gradient, expected, rtol=1e-3, atol=1e-5)
-    assert made.plan.groups_with("secant") and made.plan.groups_with("adjoint"), "both ways"
+    assert made.plan.select_groups("secant") and made.plan.select_groups("adjoint"), "both ways"

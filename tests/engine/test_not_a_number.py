@@ -24,8 +24,8 @@ def test_a_row_has_no_name_and_comes_back_as_what_it_was() -> None:
     assert (row.label, row.label_index, row.margin, row.objective, row.probability) == (None,) * 5
     assert row.correct is False and row.success is False
     again = read_judgement(row)
-    assert again.is_not_a_number and again.prediction == NOTHING.prediction == Prediction("not a number")
-    assert not read_judgement(make_trial_row("verification", 0, 1, 4, RIGHT)).is_not_a_number
+    assert again.is_non_finite and again.prediction == NOTHING.prediction == Prediction("not a number")
+    assert not read_judgement(make_trial_row("verification", 0, 1, 4, RIGHT)).is_non_finite
 
 
 def test_trials_without_a_number_are_counted_and_means_are_of_the_others() -> None:

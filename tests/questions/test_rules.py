@@ -8,10 +8,11 @@ import pytest
 from scipy.stats import fisher_exact
 
 from advsearch.questions.explain.clusters import find_clusters
-from advsearch.questions.explain.envelope import find_envelope
+from advsearch.questions.explain.envelope import find_envelope, list_factor_peels
 from advsearch.questions.explain.importance import find_importance
 from advsearch.rules import (
     CountedRule,
+    RuleCondition,
     estimate_interval,
     find_covered,
     find_rules,
@@ -244,3 +245,16 @@ def test_planted_kinds_are_told_with_the_most_typical_first(kinds: int) -> None:
     assert found.apart and found.silhouette is not None and found.silhouette > 0.3
     assert [set(truth[list(members)]) for members in found.members] == [{k} for k in range(kinds)]
     assert [members[0] for members in found.members] == list(np.cumsum(sizes) - 1)
+
+
+def test_peels_of_values_that_rounding_would_leave() -> None:
+    values = 1000.0 + np.linspace(0.1, 0.9, 41)
+    lower, upper = list_factor_peels(RuleCondition("camera.distance", "m"), pd.Series(values))
+    assert lower.low == values.min()
+    assert upper.high == np.sort(values)[-2]
+
+
+def test_peels_take_a_twentieth_at_each_end() -> None:
+    values = np.linspace(0.0, 100.0, 101)
+    lower, upper = list_factor_peels(RuleCondition("camera.azimuth", "degrees"), pd.Series(values))
+    assert (lower.low, upper.high) == (5.0, 95.0)

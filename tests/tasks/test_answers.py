@@ -69,7 +69,7 @@ def test_the_text_alone_says_what_is_right() -> None:
     assert first.right and not first.success and second.success and not second.right
     assert (first.prediction.label, second.prediction.label) == ("cup", "(nothing)")
     assert task.predictions([said("a\n\x1b[2J cup", logits)]) == [(Prediction("a [2J cup"),)]
-    assert task.judge([said("cup", logits * math.nan)], ("cup",))[0].is_not_a_number
+    assert task.judge([said("cup", logits * math.nan)], ("cup",))[0].is_non_finite
 
 
 def test_a_target_is_a_word_that_is_said() -> None:

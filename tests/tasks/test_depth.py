@@ -113,7 +113,7 @@ def test_where_nothing_is_seen_nothing_is_wrong_and_where_numbers_are_none_nothi
         broken = said(INVERSE)
         broken[0][DISPARITY][0, 0] = value
         (found,) = TASK.judge(broken, TRUTH)
-        assert found.is_not_a_number and not found.right and not found.success
+        assert found.is_non_finite and not found.right and not found.success
         assert TASK.predictions(broken)[0][0].label == NOT_A_NUMBER
     assert TASK.predictions(said(INVERSE, METRIC))[0][0].label == "metric depth from 0.417 to 2.5"
 

@@ -216,5 +216,5 @@ def test_what_is_not_a_number_is_called_that_and_what_fills_up_is_left_out(one: 
     output = task.read([{name: torch.tensor(part) for name, part in one.items()}], 1)
     (found,) = task.judge(output, TRUTH)
     assert found.prediction.label == label and found.right is (label == "cup") and not found.success
-    assert found.is_not_a_number is (label == NOT_A_NUMBER) is math.isnan(found.margin)
+    assert found.is_non_finite is (label == NOT_A_NUMBER) is math.isnan(found.margin)
     assert task.predictions(output)[0][0].label == label

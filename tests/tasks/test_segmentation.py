@@ -154,7 +154,7 @@ def test_pixels_that_are_not_numbers_are_no_output() -> None:
         (found,) = TASK.judge(output, TRUTH)
         assert (
             found.prediction == Prediction(NOT_A_NUMBER)
-            and found.is_not_a_number
+            and found.is_non_finite
             and not found.right
             and not found.success
         )

@@ -186,7 +186,7 @@ def test_a_judgement_says_where_the_right_one_stands(folder: Path, model: Model)
     }
     assert 1 < wrong.payload["rank"] <= 8  # type: ignore[operator]
     (broken,) = task.judge(torch.full((1, 12), torch.nan), truth)
-    assert broken.is_not_a_number and broken.payload is None
+    assert broken.is_non_finite and broken.payload is None
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def test_an_output_that_is_not_a_number_is_called_that(logits: list[float]) -> N
     output = torch.tensor([logits])
     for task in (NAMED, replace(NAMED, target=(2,)), replace(NAMED, minimise=True)):
         (found,) = task.judge(output, (0,))
-        assert found.prediction == Prediction("not a number", None, None) and found.is_not_a_number
+        assert found.prediction == Prediction("not a number", None, None) and found.is_non_finite
         assert not found.right and not found.success and math.isnan(found.score) and math.isnan(found.margin)
     assert NAMED.predictions(output, 3) == [(Prediction("not a number"),)]
     (found,) = NAMED.judge(torch.tensor([[1.0, 0.0, -math.inf]]), (0,))
