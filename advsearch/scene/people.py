@@ -367,6 +367,7 @@ class Person:
             number_by_name["weight"],
             number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
         )
+        # (G, A, W); and heights (H,) of bodies so mixed, of the three extremes of height
         mixture = torch.einsum(
             "g,a,w->gaw", gender_weights, age_weights, weight_weights
         )
@@ -378,9 +379,9 @@ class Person:
             torch.maximum(requested_height, statures[0]), statures[2]
         )
         height_weights = compute_interpolation_weights(clamped_height, statures)
-        return mixture[..., None] * height_weights, requested_height / (
-            height_weights * statures
-        ).sum()
+        # Beyond the extremes the body is scaled.
+        mixed_height = (height_weights * statures).sum()
+        return mixture[..., None] * height_weights, requested_height / mixed_height
 
     def _pose_bones(
         self, joints: Tensor, angle_by_joint: Mapping[str, Tensor]

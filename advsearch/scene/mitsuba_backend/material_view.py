@@ -390,8 +390,8 @@ def compute_outline_term(
         strength = dr.select(is_visible & dr.isfinite(strength), strength, 0.0)
         dr.eval(strength, hit)
     # Outside of `suspend_grad`: from here on it is differentiated by the vertices.
-    point_behind, _, _, moves = view.attach_hit(hit)
-    film_behind = dr.select(moves, view.camera.project(point_behind), 0.0)
+    point_behind, _, _, moves_behind = view.attach_hit(hit)
+    film_behind = dr.select(moves_behind, view.camera.project(point_behind), 0.0)
     speed = dr.dot(film_normal, edge_film - film_behind)
     return dr.sum(strength * speed) * -sampled.pixels_per_sample
 
@@ -609,12 +609,12 @@ def compute_shadow_term(
         strength = dr.select(dr.isfinite(strength), strength, 0.0)
         dr.eval(strength, hit)
     sample_index = lit_index.torch().to("cpu", torch.int64)
-    lit_point, _, _, moves = view.attach_hit(hit)
+    lit_point, _, _, lit_point_moves = view.attach_hit(hit)
     sine = torch.linalg.cross(
         direction, _compute_edge_directions(mesh.vertices, ends)
     ).norm(dim=1)
     edge_point = mesh.interpolate_edge(ends[sample_index], fraction[sample_index])
-    speed = dr.dot(edge_normal, edge_point - dr.select(moves, lit_point, 0.0))
+    speed = dr.dot(edge_normal, edge_point - dr.select(lit_point_moves, lit_point, 0.0))
     return (
         dr.sum(strength * to_drjit_float(sine[sample_index]) * speed)
         * -sampled.measure_per_sample
