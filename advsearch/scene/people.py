@@ -600,7 +600,7 @@ def _compute_limb_turns(
     """Return the turns (3, 3) of the bones of arm and leg of a side.
 
     Args:
-        angle: of joints, degrees.
+        angle_by_joint: degrees.
         side: "left" or "right".
         sign: 1 for the left, -1 for the right, which is its mirror image.
     """

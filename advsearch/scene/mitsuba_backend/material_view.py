@@ -810,11 +810,13 @@ def _measure_between_faces(
 ) -> tuple[Tensor, Tensor]:
     """Return where the exterior angles of edges open to (N, 3), and their sizes (N,).
 
-    The directions of an exterior angle are cos(t) along_second + sin(t) opening, with t from 0
-    to the angle: it is pi minus the angle between the faces, and pi at a single face.
+    The directions of an exterior angle are cos(t) along_second + sin(t) opening, with t
+    from 0 to the angle: it is pi minus the angle between the faces, and pi at a single
+    face.
 
     Args:
-        along_first, along_second: (N, 3) unit vectors along both faces, perpendicular to the edge.
+        along_first, along_second: (N, 3) unit vectors along both faces, perpendicular
+            to the edge.
         axis: (N, 3) unit vectors along the edges.
         is_single: (N,) whether an edge has only one face.
     """

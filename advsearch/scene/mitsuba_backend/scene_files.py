@@ -402,7 +402,11 @@ def _find_surface(
 
 
 def _find_radiance(shape: Mapping[str, object]) -> Float32Array | None:
-    """Return the radiance (1, 1, 3) of a shape that emits evenly; None of any other."""
+    """Return the radiance (1, 1, 3) of a shape that emits evenly; None of any other.
+
+    It emits evenly if its light has a constant radiance, of at most `MAX_RADIANCE`, and
+    no other entries.
+    """
     for inner in shape.values():
         if not isinstance(inner, Mapping) or inner["type"] != "area":
             continue
