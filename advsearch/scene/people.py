@@ -171,11 +171,13 @@ left.
 class Person:
     """A dressed person as a `MeshRig`.
 
-    Its largest extent at its defaults is `size` metres.
-
     Args:
         data: the arrays of body.npz, which `scenes/person.py` makes.
         defaults: default values that replace those of `PARAMETERS`.
+
+    Attributes:
+        standing_points: (V, 3) the vertices at the defaults, metres.
+        size: their largest extent, metres.
     """
 
     parameters = PARAMETERS
@@ -187,9 +189,11 @@ class Person:
         defaults: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         """Convert the arrays to tensors, and pose the person at its defaults."""
-        usual = {parameter.name: float(parameter.default) for parameter in PARAMETERS}
+        default_by_name = {
+            parameter.name: float(parameter.default) for parameter in PARAMETERS
+        }
         self.data = data
-        self.defaults = usual | dict(defaults)
+        self.defaults = default_by_name | dict(defaults)
         self._bones = [str(bone) for bone in data["bones"]]
         self._parents = [int(parent) for parent in data["parents"]]
         # `mean` (P, 3) are points in tenths of a millimetre, `basis` (R, P, 3) the

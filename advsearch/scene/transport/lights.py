@@ -404,6 +404,9 @@ class BasisRenderer(Predictor):
         traced, seed, tick: as for `LinearRenderer`.
         u: (d,) configuration; what does not change is as it is there.
         changing: what changes; None finds it.
+
+    Attributes:
+        non_finite: numbers that were not finite, and were replaced by 0.
     """
 
     def __init__(
