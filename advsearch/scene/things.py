@@ -213,7 +213,7 @@ def add_things(
     for thing in requested:
         object_spec = thing.object_spec
         name = thing.name
-        asset = with_size(load(object_spec, thing.facing), thing.size, None)
+        asset = with_size(load(object_spec, thing.facing), thing.size, unit=None)
         if asset.metres is None:
             example = f"{object_spec}@{thing.x:g},{thing.y:g},size=METRES"
             raise InputError(

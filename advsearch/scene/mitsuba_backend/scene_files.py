@@ -375,12 +375,13 @@ def _find_surface(
     It is the shape's first entry that is neither a light nor a medium, or Mitsuba's
     default. Raises UnknownNameError: a reference leads nowhere, or round in a circle.
     """
-    count = 0
+    n_plugins = 0
 
     def resolve(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
-        nonlocal count
-        count += 1
-        if count > MAX_PLUGINS:
+        """Return a plugin, which `depth` references lead to, with its own resolved."""
+        nonlocal n_plugins
+        n_plugins += 1
+        if n_plugins > MAX_PLUGINS:
             raise InputError(
                 f"object: expected a surface of at most {MAX_PLUGINS} "
                 "plugins, got more; make it simpler"

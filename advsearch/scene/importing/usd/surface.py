@@ -287,7 +287,10 @@ class UsdSurfaces:
         return self._find_or_add("materials", entry)
 
     def _convert(self, material: Any) -> BoundMaterial:
-        """Convert a material; one that is no preview surface becomes grey, with a note."""
+        """Convert a material; one that is no preview surface becomes grey, with a note.
+
+        The decoded images of the material before it are released.
+        """
         name = str(material.GetPrim().GetName())
         self._texels.clear()  # they take memory
         shader = material.ComputeSurfaceSource()[0]
@@ -635,7 +638,7 @@ class PreviewSurface:
                     "has a texture that is looked up by "
                     f"{node.kind[:100]}; st is taken for it"
                 )
-                return TextureLayout("st", None, rows)
+                return TextureLayout("st", fallback=None, matrix=rows)
         raise errors.FileFormatError(
             f"the material {self.name}: expected at most {MAX_SHADERS} shaders in a "
             "row, got more"
