@@ -588,13 +588,13 @@ def compute_shadow_term(
         sampled.direction, _compute_edge_directions(mesh.vertices, sampled.ends)
     ).norm(dim=1)
     edge_point = mesh.interpolate_edge(
-        sampled.ends[shadow.index], sampled.fraction[shadow.index]
+        sampled.ends[shadow.sample_index], sampled.fraction[shadow.sample_index]
     )
     speed = dr.dot(
         shadow.edge_normal, edge_point - dr.select(lit_point_moves, lit_point, 0.0)
     )
     return (
-        dr.sum(shadow.strength * to_drjit_float(sine[shadow.index]) * speed)
+        dr.sum(shadow.strength * to_drjit_float(sine[shadow.sample_index]) * speed)
         * -sampled.measure_per_sample
     )
 
@@ -602,7 +602,7 @@ def compute_shadow_term(
 class _ShadowBorders(NamedTuple):
     """Points of shadows' borders that the camera sees, of some of the samples."""
 
-    index: Tensor  # (m,) of the sample
+    sample_index: Tensor  # (m,)
     hit: Any  # the lit point, where the line past the edge ends
     edge_normal: Any  # unit vector, away from the mesh at the edge
     strength: Any  # how the light that passes the edge counts in the image
@@ -644,7 +644,7 @@ def _sample_shadow_borders(
     strength = dr.select(dr.isfinite(strength), strength, 0.0)
     dr.eval(strength, hit)
     return _ShadowBorders(
-        index=lit_index.torch().to("cpu", torch.int64),
+        sample_index=lit_index.torch().to("cpu", torch.int64),
         hit=hit,
         edge_normal=edge_normal,
         strength=strength,
