@@ -190,6 +190,16 @@ def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
 
 
 def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
+    """Describe what advsearch understands of a Mitsuba file; render it if `out` is given.
+
+    The first shape that is no light stands for the object.
+
+    Returns:
+        What is in the file, for JSON; and the lines of the text.
+
+    Raises:
+        InputError: an image is requested, but no shape can be the object.
+    """
     # late: another thing has this name here
     from advsearch.scene.mitsuba_backend.scene_files import read_contents
 

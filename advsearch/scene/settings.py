@@ -497,6 +497,15 @@ GROUND = (
         default=3.0,
         description="Side of the table; 0 leaves the ground out.",
     ),
+    Parameter(
+        "level",
+        (),
+        "object sizes",
+        -1e4,
+        1e4,
+        0.0,
+        "Height of the ground that takes the shadow in a photograph (`backdrop`).",
+    ),
     *Parameter.colors(
         "of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)
     ),
@@ -537,6 +546,29 @@ MATERIAL = (
         "clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)
     ),
 )
+# how what is rendered into a photograph is made to look like the rest of it
+BACKDROP = (
+    Parameter(
+        "noise",
+        (),
+        "levels of 255",
+        0.0,
+        100.0,
+        "as the photograph has",
+        "Noise of what is rendered into a photograph (`backdrop`).",
+        estimators=(),
+    ),
+    Parameter(
+        "blur",
+        (),
+        "pixels",
+        0.0,
+        20.0,
+        "as the photograph has",
+        "Blur of what is rendered into a photograph, a standard deviation.",
+        estimators=(),
+    ),
+)
 FAMILIES = {
     "camera": (
         *CAMERA,
@@ -547,6 +579,7 @@ FAMILIES = {
     "pose": POSE,
     "environment": ENVIRONMENT,
     "ground": GROUND,
+    "backdrop": BACKDROP,
     "material": MATERIAL,
     "object": (_make_lamp_parameter("the object, a car"),),
 }

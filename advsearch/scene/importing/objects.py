@@ -30,7 +30,9 @@ from advsearch.scene.assets import (
     Material,
     Mesh,
     ObjectAsset,
+    find_footing,
     group_indices,
+    make_pose,
     normalise_mesh,
 )
 from advsearch.scene.importing import gltf, gltf_parts
@@ -263,6 +265,7 @@ def make_object(
         emission=_compute_emitted(maps.emission, opacity),
         metres=extent if has_unit else None,
         extent=extent,
+        file_to_mesh=_compute_file_to_mesh(parts, soup, rotation),
     )
 
 
@@ -374,6 +377,21 @@ def _make_mesh(
         movable_parts, stored_vertices, turn / (soup_extent * mesh_extent)
     )
     return replace(normalised_mesh, rig=rig)
+
+
+def _compute_file_to_mesh(
+    parts: list[ImportedPart], soup: Soup, turn: Float64Array
+) -> Float64Array:
+    """Return the map (4, 4) from the file's coordinates to the normalised mesh's.
+
+    It is that of `join_parts` and `normalise_mesh` together; `turn` (3, 3) leads from
+    the file's axes to ours.
+    """
+    used = [part.vertices[np.unique(part.faces)] for part in parts]
+    low = np.min([points.min(axis=0) for points in used], axis=0)
+    origin, size = find_footing(soup.points[np.unique(soup.faces)])
+    linear = turn / (compute_extent(parts) * size)
+    return make_pose(linear, -linear @ low - origin / size)
 
 
 def _compute_emitted(

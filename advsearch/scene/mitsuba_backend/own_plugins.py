@@ -111,6 +111,8 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
 
 
 common: Any = mi.ad.integrators.common
+PRBIntegrator: Any = mi.ad.integrators.prb.PRBIntegrator
+PLANE_SHAPE = "ground"  # Mitsuba's id of the plane that takes the shadow
 ISOTROPIC_PHASE = 1.0 / (4.0 * math.pi)  # isotropic phase function, per steradian
 MIN_EXTINCTION = 1e-20
 MAX_SCATTERINGS = 8
@@ -388,6 +390,139 @@ def _make_event(ray: Any, si: Any, scattered: Any, distance: Any) -> Any:
 
 
 mi.register_integrator("advsearch_haze", lambda props: HazePath(props))
+
+
+class _PlaneHits:
+    """Camera rays that meet the plane first, and where their paths go on.
+
+    Args:
+        scene, sampler: as in `mi.ad.integrators.common.RBIntegrator`.
+        ray: camera rays.
+        active: which are traced at all.
+
+    Attributes:
+        is_hit: whether a ray meets the plane first.
+        direct_change: of its radiance by what hides the environment, and by lamps.
+        weight: of the light that comes along the path's next segment.
+        path_ray: that segment; of other rays, the camera ray.
+        is_traced: whether there is such a segment.
+    """
+
+    def __init__(self, scene: Any, sampler: Any, ray: Any, active: Any) -> None:
+        plane = next(shape for shape in scene.shapes() if shape.id() == PLANE_SHAPE)
+        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        self.is_hit = active & hit.is_valid() & (hit.shape == mi.ShapePtr(plane))
+        self._si = hit.compute_surface_interaction(ray, mi.RayFlags.All, self.is_hit)
+        light = self._sample_emitter(scene, sampler)
+        self.direct_change = dr.select(self.is_hit, self._factor * light, 0.0)
+        bounce, self.weight = self._si.bsdf().sample(
+            mi.BSDFContext(),
+            self._si,
+            sampler.next_1d(),
+            sampler.next_2d(),
+            self.is_hit,
+        )
+        bounced_ray = self._si.spawn_ray(self._si.to_world(bounce.wo))
+        self.path_ray = dr.select(self.is_hit, bounced_ray, ray)
+        self.is_traced = active & (~self.is_hit | (bounce.pdf > 0.0))
+
+    def _sample_emitter(self, scene: Any, sampler: Any) -> Any:
+        """Sample an emitter, and return its radiance over the density.
+
+        The factor by which that changes the plane is stored: what the plane reflects of
+        it, with -1 for the environment where something is in between, and 0 where
+        nothing is; for lamps it is the other way around, 0 and 1.
+        """
+        si = self._si
+        ds, light = scene.sample_emitter_direction(
+            si, sampler.next_2d(), False, self.is_hit
+        )
+        is_sampled = self.is_hit & (ds.pdf != 0.0)
+        is_blocked = scene.ray_test(si.spawn_ray_to(ds.p), is_sampled)
+        is_environment = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        sign = dr.select(is_blocked, 0.0, 1.0)
+        sign = dr.select(is_environment, sign - 1.0, sign)
+        reflected = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(ds.d), is_sampled)
+        self._emitter_sample = ds
+        self._factor = dr.select(is_sampled, sign * reflected, 0.0)
+        return light
+
+    def backpropagate(self, scene: Any, cotangent: Any) -> None:
+        """Add the derivative of `cotangent * direct_change` by lights."""
+        ds = self._emitter_sample
+        is_sampled = self.is_hit & (ds.pdf != 0.0)
+        with dr.resume_grad():
+            light = scene.eval_emitter_direction(self._si, ds, is_sampled)
+            light *= dr.select(is_sampled, dr.rcp(ds.pdf), 0.0)
+            if dr.grad_enabled(light):
+                # The path goes along the same edges later: they are kept.
+                change = cotangent * self._factor * light
+                dr.backward_from(change, dr.ADFlag.ClearInterior)
+
+
+class PhotographPath(PRBIntegrator):  # type: ignore[misc]
+    """Trace paths for a scene that is rendered into a photograph, with an adjoint.
+
+    It is the integrator `advsearch_photograph`. The plane that takes the shadow, the
+    shape `ground`, is not seen. Where a camera ray meets it first, the change of its
+    radiance by all that is in the scene beside it and the environment is in three more
+    channels:
+
+        - light of the environment that is kept from it + light of lamps
+        + light that other surfaces send to it
+
+    Both are exactly zero where nothing is in the way, so that the photograph stays as
+    it is there, without noise. The object sees the plane as any other surface.
+
+    The derivative is that of `prb` on what is left of the path.
+    """
+
+    def sample(
+        self,
+        mode: Any,
+        scene: Any,
+        sampler: Any,
+        ray: Any,
+        δL: Any,
+        state_in: Any,
+        active: Any,
+        δaovs: Any = None,
+        **rest: Any,
+    ) -> Any:
+        """Sample paths, or replay them; see `mi.ad.integrators.common.RBIntegrator`."""
+        plane = _PlaneHits(scene, sampler, mi.Ray3f(dr.detach(ray)), mi.Bool(active))
+        if mode != dr.ADMode.Primal:
+            change = mi.Spectrum(*δaovs)
+            plane.backpropagate(scene, change)
+            δL = dr.select(plane.is_hit, plane.weight * change, δL)
+        L, valid, _, state_out = super().sample(
+            mode=mode,
+            scene=scene,
+            sampler=sampler,
+            ray=plane.path_ray,
+            δL=δL,
+            state_in=state_in,
+            active=plane.is_traced,
+            **rest,
+        )
+        change = dr.select(plane.is_hit, plane.weight * L + plane.direct_change, 0.0)
+        color = dr.select(plane.is_hit, 0.0, L)
+        return color, valid & ~plane.is_hit, [*change], state_out
+
+    def sample_rays(self, scene: Any, sensor: Any, sampler: Any, **rest: Any) -> Any:
+        """Return rays, weights and positions, with weights that are plain numbers.
+
+        Mitsuba 3.9.1 multiplies each further channel by a weight of three channels in
+        `render_backward`, which fails. Our cameras' weights are grey.
+        """
+        ray, weight, position = super().sample_rays(scene, sensor, sampler, **rest)
+        return ray, mi.Float(weight[0]), position
+
+    def aov_names(self) -> list[str]:
+        return [f"plane.{channel}" for channel in "RGB"]
+
+
+mi.register_integrator("advsearch_photograph", lambda props: PhotographPath(props))
 
 
 class Guides(mi.SamplingIntegrator):  # type: ignore[misc]

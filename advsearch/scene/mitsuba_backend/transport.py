@@ -93,6 +93,7 @@ def collect_paths(
     depth: int,
     spp: int,
     projector: Any,
+    unseen: Any = None,
 ) -> Paths:
     """Trace one pass of light paths and collect their vertices.
 
@@ -110,8 +111,11 @@ def collect_paths(
         depth: maximum length of a path in segments.
         spp: samples per pixel.
         projector: Mitsuba's projector whose image `key` is; None for a base color.
+        unseen: Mitsuba's shape that camera rays see nothing of, nor behind it.
     """
     ray, weight = _sample_camera_rays(scene.sensors()[0], noise, size, spp)
+    if unseen is not None:
+        weight = dr.select(_find_hits(scene, ray, unseen), 0.0, weight)
     first_hit, emitted, bounces = _trace_paths(scene, ray, weight, noise, depth)
 
     # The BSDFs are evaluated once more with the base color larger by `COLOR_STEP`:
@@ -142,6 +146,12 @@ def collect_paths(
     L = dr.select(dr.isfinite(L), L, 0.0)
     channels = [*(L + emitted[0]), *first_hit]
     return _fetch_paths(channels, vertices, size, spp)
+
+
+def _find_hits(scene: Any, ray: Any, shape: Any) -> Any:
+    """Return which rays meet one of Mitsuba's shapes first."""
+    hit = scene.ray_intersect_preliminary(ray, coherent=True)
+    return hit.is_valid() & (hit.shape == mi.ShapePtr(shape))
 
 
 def _sample_camera_rays(

@@ -562,8 +562,12 @@ class LinearRenderer(Predictor):
         """
         base = self.collected.base_image()
         radiance = base[..., :3]
+        crop = self.path_renderer.crop
         for name, transport in self.collected.transports.items():
-            radiance = radiance + transport(inputs[name] - self.linearized_at[name])
+            change = transport(inputs[name] - self.linearized_at[name])
+            if crop is not None:
+                change = crop.window.pad(change, base.shape[:2])
+            radiance = radiance + change
         if base.shape[-1] == 3:
             return radiance
         return torch.cat([radiance, base[..., 3:]], dim=-1)
@@ -612,7 +616,7 @@ def _collect(
     }
     transports = {
         name: TextureTransport(
-            renderer.formation.resolution,
+            _traced_size(renderer),
             (value.shape[0], value.shape[1]),
             small=quick,
         )
@@ -623,7 +627,11 @@ def _collect(
         base = renderer.render_radiance(scene_inputs, seed, spp, has_backdrop)
         tick(spp)
     else:
-        paths = _fill_transports(renderer, transports, scene_inputs, seed, tick, spp)
+        window = renderer.crop.window if renderer.crop else None
+        with renderer.scene.limit_window(window):
+            paths = _fill_transports(
+                renderer, transports, scene_inputs, seed, tick, spp
+            )
         radiance = paths.radiance - paths.background if has_backdrop else paths.radiance
         radiance = renderer.replace_non_finite(radiance)
         base, smooth = _make_smooth(renderer, radiance, paths, quick)
@@ -631,6 +639,9 @@ def _collect(
             transport.finish(smooth)
         if has_backdrop:
             base = torch.cat([base, paths.coverage], dim=-1)
+            base = _append_plane_change(renderer, base, scene_inputs, seed, spp)
+        if renderer.crop is not None:
+            base = renderer.crop.window.paste(base, renderer.crop.surroundings)
     return LinearizedScene(
         transports=transports,
         linearized_at=linearized_at,
@@ -638,6 +649,21 @@ def _collect(
         base_image=PackedImage(base, is_small=quick),
         non_finite=renderer.non_finite - non_finite_before,
     )
+
+
+def _append_plane_change(
+    renderer: Renderer, base: Tensor, traced: Inputs, seed: int, spp: int
+) -> Tensor:
+    """Return a base image with the change of the plane that takes the shadow.
+
+    It stays as it is there. Without such a plane the image stays as it is.
+    """
+    if renderer.scene.plane_radiance is None:
+        return base
+    image = renderer.render_radiance(traced, seed, spp, True)
+    if renderer.crop is not None:
+        image = renderer.crop.window.select(image)
+    return torch.cat([base, image[..., 4:]], dim=-1)
 
 
 def _fill_transports(
@@ -654,7 +680,7 @@ def _fill_transports(
     `TransportTooLargeError` as soon as all matrices take more than `MAX_BYTES`.
     """
     samples, n_passes = plan_passes(renderer, spp)
-    height, width = renderer.formation.resolution
+    height, width = _traced_size(renderer)
     images: list[Paths] = []
     for name, transport in transports.items():
         for index in range(n_passes):
@@ -707,8 +733,15 @@ def find_linear_inputs(renderer: Renderer) -> frozenset[str]:
     )
 
 
+def _traced_size(renderer: Renderer) -> tuple[int, int]:
+    """Return height and width of what is traced of an image, in pixels."""
+    if renderer.crop is None:
+        return renderer.formation.resolution
+    return renderer.crop.window.height, renderer.crop.window.width
+
+
 def plan_passes(renderer: Renderer, spp: int) -> tuple[int, int]:
     """Return the samples per pixel of a pass, and the number of passes."""
-    height, width = renderer.formation.resolution
+    height, width = _traced_size(renderer)
     samples = max(1, min(spp, SAMPLES_PER_PASS // (height * width)))
     return samples, -(-spp // samples)
