@@ -101,8 +101,8 @@ FAULTS = (
     Fault(
         "importing: the stride of a buffer is ignored",
         "advsearch/scene/importing/gltf.py",
-        "step = stride or row_size",
-        "step = row_size",
+        "row_stride = stride or row_size",
+        "row_stride = row_size",
         ("tests/scene/test_gltf.py",),
     ),
     Fault(

@@ -92,6 +92,9 @@ class ColoredRows:
         rows, columns: its size.
         small: store it in 16 bits per fraction, and as many per column where there are
             no more than 65,536, and unpack it for each product.
+
+    Attributes:
+        entries: how many fractions are stored.
     """
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
@@ -487,6 +490,10 @@ class LinearRenderer(Predictor):
         light: inputs that replace those of u.
         collected: what was collected elsewhere with the same arguments; then nothing is
             traced.
+
+    Attributes:
+        linearized_at: the inputs where it is linearised, by name.
+        non_finite: numbers that were not finite, and were replaced by 0.
 
     Raises:
         TransportTooLargeError: a matrix would take more than `MAX_BYTES`.
