@@ -185,8 +185,9 @@ def to_plain_value(value: object) -> object:
     value = distribution_to_setting(value)
     if isinstance(value, (list, tuple)):
         return type(value)(map(to_plain_value, value))
-    is_array = hasattr(value, "tolist") and hasattr(value, "dtype")
-    return value.tolist() if is_array else value
+    if hasattr(value, "tolist") and hasattr(value, "dtype"):
+        return value.tolist()
+    return value
 
 
 def parse_spec(label: str, parameter: Parameter, setting: object) -> Spec:
