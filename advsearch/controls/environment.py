@@ -102,9 +102,9 @@ class EnvironmentControl(Control):
         setting = settings.get("which") if isinstance(settings, Mapping) else None
         if isinstance(setting, Mapping):
             setting = setting.get("choices")
-        names = setting
-        if isinstance(setting, str) or not isinstance(setting, Sequence):
-            names = [setting]
+        names: Sequence[object] = [setting]
+        if isinstance(setting, Sequence) and not isinstance(setting, str):
+            names = setting
         files = [
             name
             for name in names
