@@ -282,6 +282,8 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
                 "given to another mesh than the "
                 f"object; {able} can, as in pose:{control.name}"
             )
+    if scene.backdrop_photograph is not None:
+        _check_controls_in_photograph(controls, scene.backdrop_photograph.spec)
     described = scene
     adjusted = list[AdjustedDefault]()
     for control in controls:
@@ -302,6 +304,16 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
         environments.append(scene.environment_spec)
     environment = environments[0] if environments else None
     return Space(bound, scene, tuple(adjusted), environment)
+
+
+def _check_controls_in_photograph(controls: Sequence[Control], spec: str) -> None:
+    """Raise InputError if a control would not be true of what a photograph shows."""
+    for control in controls:
+        if control.photograph_refusal:
+            raise InputError(
+                f"`controls` {control.name} and `backdrop={spec}` contradict each "
+                f"other: {control.photograph_refusal}; leave one of the two out"
+            )
 
 
 def __getattr__(name: str) -> Any:

@@ -283,6 +283,8 @@ class Control:
             taken where there are several.
         competes_with_ambient: whether it throws light that ambient light weakens, see
             `ambient`.
+        photograph_refusal: why it would not be true of a scene that is rendered into a
+            photograph; empty if it is.
 
     Raises:
         UnknownNameError: no such parameter or choice.
@@ -299,6 +301,7 @@ class Control:
     travels: ClassVar[bool] = False
     competes_with_ambient: ClassVar[bool] = False
     amount: ClassVar[str | None] = None
+    photograph_refusal: ClassVar[str] = ""
     on_top: bool = False
     name: str
     scene: SceneDescription

@@ -29,6 +29,11 @@ from advsearch.options import describe_value, format_things
 from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Float32Array, ObjectAsset
+from advsearch.scene.backdrop import (
+    BackdropPhotograph,
+    find_light_beside,
+    fit_to_photograph,
+)
 from advsearch.scene.camera_model import make_bundled_models, make_pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
@@ -65,6 +70,9 @@ or its instance, and ``mitsuba:KEY`` a range.
 """
 
 Texture = str | Path | npt.ArrayLike | Tensor
+
+PHOTOGRAPH_SETTINGS = ("ground.level", "backdrop.noise", "backdrop.blur")
+"""Settings that only a scene has which is rendered into a photograph."""
 
 SINGLE_VALUE_KEYS = {"distribution", "choices", "range"}
 """A mapping with one of these keys describes one value, and not the settings of a
@@ -226,6 +234,8 @@ def load_scene(
     | Mapping[str, object]
     | Sequence[str | Mapping[str, object]]
     | None = None,
+    backdrop: str | Path | BackdropPhotograph | None = None,
+    occluder: str | Path | None = None,
 ) -> Scene:
     """Load a scene.
 
@@ -261,6 +271,12 @@ def load_scene(
             its left: a text such as "car@12,3.5,heading=180; person@6,-2", or a list of
             such texts or of mappings, {"object": "car", "x": 12, "y": 3.5, "heading":
             180}; `size` (metres), `name` and `label` are optional.
+        backdrop: a photograph that the scene is rendered into (docs/cameras.md): a
+            picture file, taken by `camera`; of a part of it,
+            ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels. By default it is lit by the .hdr
+            or .exr file of its name beside it, if there is one.
+        occluder: a mask of the photograph's size, white where it shows what is before
+            the object.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of
@@ -275,6 +291,8 @@ def load_scene(
     if scene is not None and mitsuba_dict is None:
         object_spec = f"{scene}#{object}"
     fixed_values = None if settings is None else to_python(settings)
+    if environment is None:
+        environment = find_light_beside(backdrop)
     description = load_description(
         object_spec,
         environment,
@@ -288,12 +306,30 @@ def load_scene(
     )
     if camera is not None:
         description = description.with_camera(camera)
+    if backdrop is not None:
+        description = description.with_backdrop(backdrop, occluder)
+    else:
+        _check_no_photograph(fixed_values or {}, occluder)
     has_asset = any(
         asset is not None and not isinstance(asset, (str, Path))
-        for asset in (object, environment)
+        for asset in (object, environment, backdrop)
     )
     loaded = Scene(description, is_session_only=mitsuba_dict is not None or has_asset)
     return loaded if texture is None else loaded.with_texture(texture)
+
+
+def _check_no_photograph(
+    fixed_values: SettingValues, occluder: str | Path | None
+) -> None:
+    """Raise InputError for what says something of a photograph where there is none."""
+    stated = [name for name in fixed_values if name in PHOTOGRAPH_SETTINGS]
+    if occluder is not None:
+        stated.append("occluder")
+    if stated:
+        raise InputError(
+            f"{stated[0]}: is about a photograph that the scene is rendered into, and "
+            "there is none; give a `backdrop`, or leave it out"
+        )
 
 
 def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
@@ -330,6 +366,7 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
     parts that these settings cannot name.
     """
     description = scene.description
+    photograph = description.backdrop_photograph
     return {
         "object": description.object_name,
         "environment": description.environment_name,
@@ -339,6 +376,8 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
         "unit": description.unit,
         "camera": _camera_setting(description),
         "things": description.things_spec or None,
+        "backdrop": photograph.spec if photograph is not None else None,
+        "occluder": (photograph.front_spec or None) if photograph is not None else None,
         "set": description.requested_values,
     }
 
@@ -365,10 +404,15 @@ def fit_camera(
         resolution: side, or (height, width), in pixels.
 
     Raises:
-        InputError: several cameras and drops on a lens.
+        InputError: several cameras and drops on a lens; or the scene is rendered into
+            a photograph of another shape.
     """
     height, width = _height_and_width(resolution)
     aspect = width / height
+    if description.backdrop_photograph is not None:
+        return fit_to_photograph(
+            description, description.backdrop_photograph, (height, width)
+        )
     camera_model = description.camera_model
     remarks = description.remarks
     if description.number("camera.drops") > 0.0:

@@ -101,6 +101,7 @@ class SurfaceLight(PredictedSearch):
     # coordinates of conditions need another light; `_has_moving` and
     # `_searches_colors`, whether a searched coordinate moves something, or colors it.
     method: ClassVar[str] = "surface light"
+    title: ClassVar[str] = "finding the light on surfaces"
     light_u: Tensor | None = None
     moving_coordinates: Tensor | None = None
     _renderer: SurfaceRenderer | None = None

@@ -139,7 +139,7 @@ class Waypoints:
         quaternion = self.interpolate(time, self.rotations)
         quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(1e-9)
         entries = torch.stack(
-            geometry.rotation_entries(*quaternion.unbind(dim=-1)), dim=-1
+            geometry.compute_rotation_entries(*quaternion.unbind(dim=-1)), dim=-1
         )
         return entries.reshape(*entries.shape[:-1], 3, 3)
 
@@ -524,6 +524,13 @@ class PathControl(Control):
                 f"`controls` {self.name}: moves the camera, and the scene is seen by "
                 f"its camera {scene.camera!r}; give "
                 f"moves=object, or have it seen by 'orbit'"
+            )
+        photograph = scene.backdrop_photograph
+        if CAMERA in self._movers and photograph is not None:
+            raise InputError(
+                f"`controls` {self.name} and `backdrop={photograph.spec}` contradict "
+                "each other: the photograph was taken from one place; give "
+                "moves=object, or leave one of the two out"
             )
         self._check_needless()
         in_scene = self.with_scene(scene)
