@@ -195,7 +195,7 @@ FAULTS = (
     Fault(
         "policies: every generation has the same noise",
         "advsearch/attacks/policies/evolution.py",
-        "seeded(self.seed, self.generation * (self.population // 2) + pair)",
+        "seeded(self.seed, self.generation * pairs_per_generation + pair)",
         "seeded(self.seed, pair)",
         ("tests/attacks/policies/test_policy_evolution.py",),
     ),

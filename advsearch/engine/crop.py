@@ -1,8 +1,8 @@
 """Searches that render only the window of the image in which something can change.
 
-The rest of each image is that of a whole one. It is rendered again every
+The rest of each image is that of a full one. It is rendered again every
 `COMPARISON_INTERVAL` evaluations, which also measures what was missed. Where this is
-too much twice in a row, the rest of the search renders whole images. The ranking and
+too much twice in a row, the rest of the search renders full images. The ranking and
 all trials do so anyway. How the window is chosen: `advsearch.engine.windows`.
 """
 
@@ -19,11 +19,11 @@ from advsearch.attacks.evaluation import Query
 from advsearch.engine.transport import COMPARISON_INTERVAL, PredictedSearch
 from advsearch.engine.windows import (
     PROBE_SPP,
-    WholeImage,
+    FullImage,
     Windowing,
     find_window,
     measure_outside,
-    render_whole,
+    render_full_image,
 )
 from advsearch.scene.predictor import Refusal
 from advsearch.scene.renderer import Renderer
@@ -45,8 +45,9 @@ class CroppedSearch(PredictedSearch):
 
     windowing: Windowing | None = None
     refusal: Refusal | None = None
-    # the latest whole image of each kind of search, and the renderer with that around
-    _current: dict[str, tuple[WholeImage, Renderer]] = field(default_factory=dict)
+    # the latest full image of each kind of search, and the renderer that pastes windows
+    # into its surroundings
+    _current: dict[str, tuple[FullImage, Renderer]] = field(default_factory=dict)
 
     @property
     def n_samples(self) -> int:
@@ -79,9 +80,17 @@ class CroppedSearch(PredictedSearch):
             self._use(windowing, "start", 0, windowing.start)
 
     def _use(
-        self, windowing: Windowing, kind: str, number: int, image: WholeImage
+        self, windowing: Windowing, kind: str, number: int, image: FullImage
     ) -> Renderer:
-        """Render the surroundings that a kind of search has from now on."""
+        """Render the surroundings that a kind of search has from now on, and return the
+        renderer that pastes windows into them.
+
+        Args:
+            windowing: the window.
+            kind: of search, or "start" for all that have none of their own yet.
+            number: of the evaluation.
+            image: the full image at whose configuration they are rendered.
+        """
         problem = self.problem
         seed = seeds.stream(problem.seed, f"crop {kind}", number)
         with problem.renderer.scene.limit_depth(problem.search_depth):
@@ -102,14 +111,17 @@ class CroppedSearch(PredictedSearch):
         return self.problem.evaluate_full(query, query.u, query.seed, renderer)[0]
 
     def _update(self, query: Query) -> Renderer | None:
-        """Return the renderer of a query; None where whole images are rendered.
+        """Return the renderer of a query; None where full images are rendered.
 
-        Where that is due, a whole image is rendered, measured and used.
+        Every `COMPARISON_INTERVAL` evaluations a full image is rendered and compared,
+        and surroundings are rendered anew. If the comparison fails twice in a row, full
+        images are rendered from then on.
         """
         kind = query.kind
         number = query.number
-        first_whole = self.first_traced.get(kind, self.steps)
-        if query.phase != "search" or number >= first_whole:
+        first_full = self.first_traced.get(kind, self.steps)
+        # Full images are rendered from this evaluation on.
+        if query.phase != "search" or number >= first_full:
             return None
         if self.windowing is None:
             self.prepare()
@@ -119,21 +131,19 @@ class CroppedSearch(PredictedSearch):
             return renderer
         was_accepted = self.deviations[-1].is_accepted
         with self.count_time():
-            whole = self._measure(self.windowing, image, query.u)
+            full_image = self._measure(self.windowing, image, query.u)
             if self.deviations[-1].is_accepted or was_accepted:
                 self.n_renewals = (self.n_renewals or 0) + 1
-                return self._use(self.windowing, kind, number, whole)
+                return self._use(self.windowing, kind, number, full_image)
         self.trace_from(kind, number, f" of the {kind}")
         return None
 
-    def _measure(
-        self, windowing: Windowing, image: WholeImage, u: Tensor
-    ) -> WholeImage:
+    def _measure(self, windowing: Windowing, image: FullImage, u: Tensor) -> FullImage:
         """Measure how far the surroundings of an image are off at u (d,), and return
-        the whole image there.
+        the full image there.
         """
-        whole = render_whole(self.problem, u)
+        full_image = render_full_image(self.problem, u)
         self.n_traced += 1
-        deviation = measure_outside(self.problem, windowing.window, image, [whole])
+        deviation = measure_outside(self.problem, windowing.window, image, [full_image])
         self.deviations.append(deviation)
-        return whole
+        return full_image
