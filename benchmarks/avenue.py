@@ -3,6 +3,7 @@ ball around a road.
 
     python benchmarks/avenue.py [--size 300] [--spp 16] [--rounds 5] [--steps 40]
     python benchmarks/avenue.py --attacks                              # whole attacks alone
+    python benchmarks/avenue.py --searches [--distances 10 30 60] [--seeds 1]
 
 It prints processor time as ratios: a warm picture (a primal render with the denoiser's
 guides), the gradient of a texture, and a search of `--steps` steps with both; and the
@@ -10,11 +11,17 @@ seconds and the memory of loading each. Left out are the model, the random searc
 beside, verification and the report, which do not know where the car stands. Last come
 whole attacks on the texture with all of that, each in a process of its own, and the
 most memory that each process has had.
+
+`--searches` measures the search of an attack alone, as a run makes it: with the window
+of the picture that it chooses, and with whole pictures, both by matrices of light
+transport and by renders; and in how many of the seeds whole traced pictures of what it
+found are wrong. The model is to call the car what it calls it at the start.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import resource
 import statistics
@@ -22,13 +29,28 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 
-from advsearch import load_scene
+from advsearch import load_model, load_scene
+from advsearch.attacks import Policy, SearchResult
+from advsearch.engine import windows
+from advsearch.engine.crop import CroppedSearch
+from advsearch.engine.journal import Journal, ParallelEvaluator
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import RunState
+from advsearch.engine.transport import CleanMatrix
+from advsearch.progress import NullProgress, Stages
+from advsearch.questions.attack import stages
+from advsearch.questions.attack.carry_out import load_parts, make_problem
+from advsearch.questions.attack.run import choose_policy
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.matrix import LinearRenderer
 
 PLACES = ("street", "avenue")
+TRIAL_SPP = 64
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,7 +78,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="of the camera, metres (default 15)",
     )
     parser.add_argument("--attacks", action="store_true", help="whole attacks alone")
+    parser.add_argument("--searches", action="store_true", help="searches alone")
+    parser.add_argument(
+        "--distances",
+        type=float,
+        nargs="+",
+        default=[10.0, 30.0, 60.0],
+        help="of the camera in `--searches`, metres",
+    )
+    parser.add_argument("--seeds", type=int, default=1, help="of `--searches`")
+    parser.add_argument(
+        "--renders",
+        type=int,
+        default=0,
+        help="steps of searches without matrices in `--searches` (default 0: none)",
+    )
     args = parser.parse_args(argv)
+    if args.searches:
+        for distance in args.distances:
+            _compare_searches(distance, args)
+        return 0
     if not args.attacks:
         _compare(args)
     costs = {place: _in_a_process(place, args) for place in PLACES}
@@ -82,7 +123,7 @@ def _compare(args: argparse.Namespace) -> None:
         scene = load_scene(
             "car",
             place,
-            settings={"camera.elevation": 8.0, "camera.distance": args.distance},
+            settings=_camera(args.distance),
         )
         read = time.perf_counter() - begin
         renderers[place] = scene.renderer(["texture"], resolution=args.size)
@@ -134,7 +175,7 @@ def _in_a_process(place: str, args: argparse.Namespace) -> tuple[float, float]:
 ATTACK = """
 import json, resource, sys, tempfile, advsearch
 asked = json.loads(sys.argv[1])
-settings = {"camera.elevation": 8.0, "camera.distance": asked["distance"]}
+settings = {"camera.azimuth": 0.0, "camera.elevation": 5.0, "camera.distance": asked["distance"]}
 with tempfile.TemporaryDirectory() as folder:
     advsearch.attack(
         advsearch.load_scene("car", asked["place"], settings=settings), controls="texture", steps=asked["steps"],
@@ -144,6 +185,137 @@ with tempfile.TemporaryDirectory() as folder:
 used = resource.getrusage(resource.RUSAGE_SELF)
 print(json.dumps([used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0]))
 """
+
+
+def _camera(distance: float) -> dict[str, float]:
+    """The settings of a camera in the road, so many metres before the car."""
+    return {
+        "camera.azimuth": 0.0,
+        "camera.elevation": 5.0,
+        "camera.distance": distance,
+    }
+
+
+class SearchCost(NamedTuple):
+    """What a search took, and what became of it."""
+
+    seconds: float  # of the processor
+    area: float  # fraction of the picture that was traced
+    is_found: bool  # whole traced pictures of the best texture are wrong
+
+
+def _compare_searches(distance: float, args: argparse.Namespace) -> None:
+    """Print what searches at a distance take in each place, with a window and whole."""
+    ways = {"by matrices": (False, args.steps)}
+    if args.renders:
+        ways["by renders"] = (True, args.renders)
+    for name, (is_rendered, steps) in ways.items():
+        seconds: dict[tuple[str, bool], float] = {}
+        for place in PLACES:
+            for is_whole in (False, True):
+                costs = [
+                    _search_once(
+                        place, distance, seed, steps, is_whole, is_rendered, args
+                    )
+                    for seed in range(args.seeds)
+                ]
+                seconds[place, is_whole] = statistics.fmean(c.seconds for c in costs)
+                print(
+                    f"  {distance:.0f} m, {place}, {name}, {steps} steps, "
+                    f"{'whole' if is_whole else 'window'}: "
+                    f"{seconds[place, is_whole]:.1f} processor seconds, "
+                    f"{100 * costs[0].area:.0f} % of the picture, found in "
+                    f"{sum(cost.is_found for cost in costs)} of {args.seeds}",
+                    flush=True,
+                )
+        window = seconds["avenue", False]
+        print(
+            f"{distance:.0f} m, {name}: avenue with a window / street whole "
+            f"{window / seconds['street', True]:.2f}, / street with a window "
+            f"{window / seconds['street', False]:.2f}, / avenue whole "
+            f"{window / seconds['avenue', True]:.2f}; avenue / street, both whole "
+            f"{seconds['avenue', True] / seconds['street', True]:.2f}",
+            flush=True,
+        )
+
+
+def _search_once(
+    place: str,
+    distance: float,
+    seed: int,
+    steps: int,
+    is_whole: bool,
+    is_rendered: bool,
+    args: argparse.Namespace,
+) -> SearchCost:
+    """Search once, as an attack does; kernels are compiled before."""
+    config = AttackConfig(
+        object="car",
+        environment=place,
+        controls={"texture": {}},
+        resolution=(args.size, args.size),
+        steps=steps,
+        seed=seed,
+        set=_camera(distance),
+        label=_find_label(place, distance, args.size),
+    )
+    parts = load_parts(config)
+    problem = make_problem(parts)
+    policy = choose_policy(parts.policy, problem, None)
+    _warm_up(problem)
+    area = windows.MAX_AREA
+    windows.MAX_AREA = 0.0 if is_whole else area
+    begin = time.process_time()
+    try:
+        findings, result = _run_search(problem, policy, is_rendered)
+    finally:
+        windows.MAX_AREA = area
+    seconds = time.process_time() - begin
+    trials = [problem.picture(result.best_u, 1000 + n, TRIAL_SPP) for n in range(3)]
+    is_found = all(problem.judge(one, result.best_u).success for one in trials)
+    window = findings.predictor.window if findings.predictor else None
+    fraction = window.area / args.size**2 if window else 1.0
+    return SearchCost(seconds, fraction, is_found)
+
+
+def _run_search(
+    problem: Problem, policy: Policy[Any], is_rendered: bool
+) -> tuple[RunState, SearchResult]:
+    """Make the search of an attack."""
+    journal = Journal(None, ParallelEvaluator(problem))
+    findings = RunState()
+    progress = Stages(NullProgress())
+    if is_rendered:
+        crop = CroppedSearch(problem, problem.steps)
+        crop.prepare()
+        findings.predictor = None if crop.refusal else crop
+    else:
+        findings.predictor = stages.choose_predictor(
+            policy, journal, progress, findings, specialise=True, clean=CleanMatrix()
+        )
+    searches = stages.Searches(journal, progress, findings)
+    result = searches.search(
+        "search", policy, problem.steps, problem.seed, ranked=False
+    )
+    return findings, result
+
+
+def _warm_up(problem: Problem) -> None:
+    """Compile the kernels of a search."""
+    start = problem.domain.start
+    LinearRenderer(problem.renderer, start, 1, spp=1)
+    _gradient(problem.renderer, 0, 1)
+
+
+@functools.cache
+def _find_label(place: str, distance: float, size: int) -> str:
+    """What the model calls the car at the start."""
+    model = load_model("reference")
+    scene = load_scene("car", place, settings=_camera(distance))
+    renderer = scene.renderer(["texture"], resolution=size)
+    with torch.no_grad():
+        output = model(renderer(renderer.start, 0, TRIAL_SPP))
+    return model.labels[int(output[0].argmax())]
 
 
 def _picture(renderer: Renderer, seed: int, spp: int) -> None:
