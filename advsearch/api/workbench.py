@@ -113,6 +113,7 @@ from advsearch.runs.summary import read_configuration as read_configuration
 from advsearch.runs.tables import units_of as units_of
 from advsearch.scene import library as library
 from advsearch.scene.assembly import pose_mesh as pose_mesh
+from advsearch.scene.camera_files import read_camera as read_camera
 from advsearch.scene.glb import encode_glb as encode_glb
 from advsearch.scene.grounds import is_paved as is_paved
 from advsearch.scene.importing.files import last_line as last_line
@@ -129,6 +130,7 @@ from advsearch.threads import cores as cores
 from advsearch.trust.code import allow_named as allow_named
 from advsearch.trust.programs import find_blender as find_blender
 from advsearch.trust.programs import surroundings as surroundings
+from advsearch.trust.yaml_text import parse_yaml as parse_yaml
 
 
 def load_photographs() -> Any:

@@ -342,6 +342,48 @@ class Extent(Fields):
         )
 
 
+class Estimate(Fields):
+    """An estimated number with its interval."""
+
+    value: JsonFloat
+    interval: Interval | None = Field(description="95 %; null where there is none")
+
+
+class TwinAgreement(Fields):
+    """How far the predictions of renders hold for photographs of the same views.
+
+    A twin is the render of an object as a photograph shows it.
+    """
+
+    model: str
+    task: str
+    surroundings: str = Field(
+        description="what is around the object in the twins: `photograph`, or the "
+        "name of an environment; `photograph without the object` is a control"
+    )
+    object: str = Field(description="empty: all of them")
+    condition: str = Field(description="of the photographs; empty: all of them")
+    pairs: int = Field(description="photographs with a twin")
+    frames: int = Field(description="independent frames or scenes that they are of")
+    wrong_photos: int
+    wrong_twins: int
+    both_wrong: int
+    photo_right: Estimate
+    twin_right: Estimate
+    agreement: Estimate = Field(description="both right, or both wrong")
+    kappa: Estimate | None = Field(
+        description="Cohen's, of right and wrong; null where too few are wrong"
+    )
+    margins: Estimate | None = Field(
+        description="Spearman's correlation of the margins; null where it has none"
+    )
+    photo_wrong: Estimate = Field(description="rate of wrong photographs")
+    wrong_where_twin_wrong: Estimate | None = Field(
+        description="rate of wrong photographs where the twin is wrong; null where "
+        "too few twins are wrong"
+    )
+
+
 class StudyResult(RunResult):
     """What several attacks found; each is a run of its own in the folder `parts`."""
 

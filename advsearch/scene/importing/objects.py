@@ -30,6 +30,7 @@ from advsearch.scene.assets import (
     Material,
     Mesh,
     ObjectAsset,
+    find_footing,
     group_indices,
     normalise_mesh,
 )
@@ -257,7 +258,23 @@ def make_object(
         emission=_compute_emitted(maps.emission, opacity),
         metres=extent if has_unit else None,
         extent=extent,
+        origin=_find_origin(soup, parts, turn),
     )
+
+
+def _find_origin(
+    soup: Soup, parts: list[ImportedPart], turn: Float64Array
+) -> tuple[float, float, float]:
+    """Return the point of the file's coordinates below the middle of the object.
+
+    `turn` (3, 3) leads from the file's axes to those of the soup, which `join_parts`
+    made of the parts.
+    """
+    used = [part.vertices[np.unique(part.faces)] for part in parts]
+    lowest = np.min([points.min(axis=0) for points in used], axis=0)
+    footing, _ = find_footing(soup.points[np.unique(soup.faces)])
+    x, y, z = lowest + compute_extent(parts) * (turn.T @ footing)
+    return float(x), float(y), float(z)
 
 
 def _select_visible_parts(

@@ -1,0 +1,388 @@
+"""Render the twins of photographs, show all to a model, and count.
+
+The rows are stored one by one, so that a run that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from torch import Tensor
+
+from advsearch.extend import (
+    InputError,
+    Model,
+    RunContext,
+    Task,
+    tasks,
+    workbench,
+)
+from advsearch.questions.twins import counting, rendering
+from advsearch.questions.twins.listing import PhotographedObject, read_photographs
+from advsearch.questions.twins.result import (
+    CLASSIFIER_MARGIN,
+    COMPOSED,
+    DETECTOR_MARGIN,
+    HOLE,
+    TwinPair,
+    TwinPrediction,
+    TwinRow,
+    TwinsConfig,
+    TwinsResult,
+)
+
+LOW_OVERLAP = 0.8  # of silhouettes: below it a pose is doubted
+IMAGE_SIZE = 160  # longer side, pixels, of images on the page
+RENDERS_PER_ROW = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The objects in photographs that a run compares.
+
+    Attributes:
+        windows: of the rows that are used, by their number.
+        objects: of all rows.
+        warnings: about what was left out.
+    """
+
+    objects: Sequence[PhotographedObject]
+    windows: Mapping[int, rendering.Window]
+    warnings: list[str]
+
+
+def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> TwinsResult:
+    """Compare photographs with their twins.
+
+    Args:
+        context: of the run.
+        network: the model, where a Python caller passes one.
+    """
+    config = context.config
+    context.progress.stage("loading")
+    listing = read_photographs(Path(config.photographs).expanduser())
+    task = workbench.make_task(config.task)
+    settings: Any = config
+    (model,), warnings = workbench.load_models(
+        [network or config.model], task, settings
+    )
+    task = task.on(model)
+    if task.ambiguities:
+        raise InputError(f"task {task.name}: {task.ambiguities}")
+    comparison = Comparison(context, task, model)
+    selection = comparison.select(listing.objects)
+    if listing.n_missing:
+        warnings.append(
+            f"{listing.n_missing} objects are in photographs that are not there; they "
+            "are left out."
+        )
+    warnings += selection.warnings
+    measurements = context.open_measurements()
+
+    def make_result(rows: list[TwinRow]) -> TwinsResult:
+        return comparison.make_result(rows, [*warnings, *task.remarks])
+
+    return measurements.collect(
+        comparison.compare(selection, measurements), make_result
+    )
+
+
+class Comparison:
+    """Compares photographs with their twins for one model and task.
+
+    Args:
+        context: of the run.
+        task: judges the predictions of the model.
+        model: predicts.
+    """
+
+    def __init__(
+        self, context: RunContext[TwinsConfig], task: Task, model: Model
+    ) -> None:
+        self._context = context
+        self._config = context.config
+        self._task = task
+        self._model = model
+        self._size = model.input_size
+        self.n_renders = 0
+        self._load_photograph = lru_cache(maxsize=4)(rendering.load_photograph)
+
+    @property
+    def surroundings(self) -> tuple[str, ...]:
+        """What surrounds the object in the twins."""
+        return COMPOSED, self._config.environment_name, HOLE
+
+    @property
+    def margin(self) -> float:
+        """How far a window reaches beyond the object's box, in its longer sides."""
+        if self._config.margin is not None:
+            return self._config.margin
+        return DETECTOR_MARGIN if self._task.varies else CLASSIFIER_MARGIN
+
+    def select(self, objects: Sequence[PhotographedObject]) -> Selection:
+        """Choose the rows that are used, and their windows.
+
+        Raises:
+            InputError: none is left, or the model does not know a label.
+        """
+        is_frame = parse_frames(self._config.frames)
+        assets: dict[Path, Any] = {}
+        windows: dict[int, rendering.Window] = {}
+        n_hidden = 0
+        n_outside = 0
+        for number, item in enumerate(objects):
+            if not is_frame(item.frame):
+                continue
+            if item.visible is not None and item.visible < self._config.visible:
+                n_hidden += 1
+                continue
+            if item.mesh not in assets:
+                self._task.check(self._make_facts(item))
+                self._context.progress.stage(f"reading {item.object}")
+                assets[item.mesh] = self._load_asset(item)
+            positions = rendering.project_object(item, assets[item.mesh])
+            height, width = self._load_photo(item).shape[:2]
+            window = rendering.choose_window(
+                positions, (height, width), self._size, self.margin
+            )
+            if window is None:
+                n_outside += 1
+            else:
+                windows[number] = window
+        if not windows:
+            raise InputError(
+                "photographs: no object is left; check `frames` and `visible`"
+            )
+        warnings = []
+        if n_hidden:
+            warnings.append(
+                f"{n_hidden} objects are hidden by more than "
+                f"{1.0 - self._config.visible:.0%} and left out (`visible`)."
+            )
+        if n_outside:
+            warnings.append(
+                f"{n_outside} objects are out of view or smaller than "
+                f"{rendering.MIN_SILHOUETTE:g} pixels and left out."
+            )
+        return Selection(objects, windows, warnings)
+
+    def _load_asset(self, item: PhotographedObject) -> Any:
+        return rendering.load_object(item.mesh, item.unit)
+
+    def _load_photo(self, item: PhotographedObject) -> Tensor:
+        return self._load_photograph(item.photograph)
+
+    def compare(self, selection: Selection, measurements: Any) -> Iterator[TwinRow]:
+        """Yield the rows, object by object, so that each mesh is loaded once."""
+        context = self._context
+        context.progress.stage("twins", len(selection.windows))
+        groups: dict[tuple[Path, float], list[int]] = {}
+        for number in selection.windows:
+            item = selection.objects[number]
+            key = (item.mesh, round(item.camera.pixel_aspect, 3))
+            groups.setdefault(key, []).append(number)
+        for numbers in groups.values():
+            renderer = None
+            for number in numbers:
+                name = f"twin {number}"
+                if renderer is None and measurements.stored(name) is None:
+                    renderer = self._make_renderer(selection, numbers)
+                yield measurements.get_row(
+                    name,
+                    TwinRow,
+                    lambda number=number, renderer=renderer: self._compare_object(
+                        number, selection, renderer
+                    ),
+                )
+                context.progress.advance(1)
+
+    def _make_renderer(
+        self, selection: Selection, numbers: Sequence[int]
+    ) -> rendering.ObjectRenderer:
+        item = selection.objects[numbers[0]]
+        config = self._config
+        return rendering.ObjectRenderer(
+            self._load_asset(item),
+            item.unit,
+            light=config.light,
+            environment=config.environment_name,
+            film=rendering.choose_film(
+                [selection.windows[number] for number in numbers],
+                item.camera.pixel_aspect,
+            ),
+            spp=config.spp,
+            seed=config.seed,
+        )
+
+    def _compare_object(
+        self,
+        number: int,
+        selection: Selection,
+        renderer: rendering.ObjectRenderer,
+    ) -> TwinRow:
+        """Render an object's twins, and return what the model says of all images."""
+        item = selection.objects[number]
+        window = selection.windows[number]
+        twin = renderer.render(
+            item, self._load_photo(item), window, self._size, number=number
+        )
+        self.n_renders += RENDERS_PER_ROW
+        facts = self._make_facts(item, twin)
+        self._save_images(number, twin)
+        return TwinRow(
+            number=number,
+            photograph=item.photograph.name,
+            frame=item.frame,
+            object=item.object,
+            label=self._find_label(item),
+            condition=item.condition,
+            window=window,
+            size=twin.size,
+            brightness=twin.brightness,
+            contrast=twin.contrast,
+            visible=item.visible,
+            overlap=rendering.measure_pose(item, twin, window),
+            predictions=list(self._predict(twin, facts)),
+        )
+
+    def _predict(self, twin: rendering.Twin, facts: Any) -> Iterator[TwinPrediction]:
+        """Yield the predictions about the photograph and its twins."""
+        truth = self._task.truth(facts)
+        for name, image in twin.images.items():
+            rounded = (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
+            output = self._model(rounded)
+            (judgement,) = workbench.judge_images(
+                self._task, output, rounded[None], [truth]
+            )
+            yield TwinPrediction(
+                surroundings=name,
+                label=judgement.prediction.label,
+                probability=judgement.prediction.probability,
+                right=judgement.right,
+                margin=judgement.margin,
+                payload=judgement.payload,
+            )
+
+    def _make_facts(
+        self, item: PhotographedObject, twin: rendering.Twin | None = None
+    ) -> Any:
+        """Return what a task takes the truth from."""
+        return tasks.Facts(
+            item.object,
+            self._find_label(item),
+            compute_sight=None if twin is None else lambda: twin.sight,
+        )
+
+    def _find_label(self, item: PhotographedObject) -> str:
+        """Return the right label: by `names`, by the list, or the object's name."""
+        return self._config.names.get(item.object) or item.label or item.object
+
+    def _save_images(self, number: int, twin: rendering.Twin) -> None:
+        """Store small images of the photograph and its twins."""
+        for index, name in enumerate(list(twin.images)[:3]):
+            file = image_name(number, index)
+            self._context.run.write_file(file, encode_jpeg(twin.images[name]))
+
+    def make_result(
+        self, rows: Sequence[TwinRow], warnings: Sequence[str]
+    ) -> TwinsResult:
+        """Count rows; the worst disagreements come first."""
+        table = []
+        factors = []
+        if rows:
+            table = counting.make_table(
+                rows, self.surroundings, self._model.name, self._task.title
+            )
+            factors = counting.explain_disagreement(rows, COMPOSED)
+        overlaps = [row.overlap for row in rows if row.overlap is not None]
+        worst = sorted(rows, key=rank_disagreement)[: self._config.pictures]
+        return self._context.result(
+            TwinsResult,
+            photographs=self._config.photographs,
+            model=self._model.name,
+            task=self._task.title,
+            table=table,
+            overlap=float(np.median(overlaps)) if overlaps else None,
+            low_overlaps=sum(overlap < LOW_OVERLAP for overlap in overlaps),
+            factors=factors,
+            pairs=[
+                TwinPair(
+                    row=row,
+                    pictures=[image_name(row.number, index) for index in range(3)],
+                )
+                for row in worst
+            ],
+            renders=self.n_renders,
+            warnings=list(dict.fromkeys(warnings)),
+        )
+
+
+def rank_disagreement(row: TwinRow) -> tuple[bool, float]:
+    """Return a key that sorts rows: who disagree first, by how much margins differ."""
+    twin = row.twin(COMPOSED)
+    difference = abs(row.photo.margin - twin.margin)
+    if not math.isfinite(difference):
+        difference = math.inf
+    return row.photo.right == twin.right, -difference
+
+
+def parse_frames(text: str | None) -> Any:
+    """Return a function that states whether a frame is used, by its name.
+
+    Args:
+        text: names and ranges FIRST:LAST of the numbers that names end in, both
+            included, separated by commas; None for all frames.
+
+    Raises:
+        InputError: a range is none.
+    """
+    if text is None:
+        return lambda frame: True
+    names = set()
+    ranges = []
+    for entry in filter(None, (part.strip() for part in text.split(","))):
+        first, colon, last = entry.partition(":")
+        if not colon:
+            names.add(entry)
+        elif first.isdecimal() and last.isdecimal():
+            ranges.append((int(first), int(last)))
+        else:
+            raise InputError(
+                f"frames: expected a name or a range such as 0:600, got {entry[:40]}"
+            )
+
+    def is_used(frame: str) -> bool:
+        number = frame.rpartition("/")[2].partition(".")[0]
+        if frame in names or number in names:
+            return True
+        return number.isdecimal() and any(
+            first <= int(number) <= last for first, last in ranges
+        )
+
+    return is_used
+
+
+def image_name(number: int, index: int) -> str:
+    """Return the file of an image of a row in the run's folder."""
+    return f"images/twin-{number:06d}-{index}.jpg"
+
+
+def encode_jpeg(image: Tensor) -> bytes:
+    """Return an image (H, W, 3) sRGB as a JPEG, `IMAGE_SIZE` pixels at its longer
+    side.
+    """
+    levels = (image.clamp(0.0, 1.0) * 255.0).round().byte().numpy()
+    picture = Image.fromarray(levels)
+    scale = IMAGE_SIZE / max(picture.size)
+    size = (round(picture.width * scale), round(picture.height * scale))
+    buffer = io.BytesIO()
+    picture.resize(size, Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=88)
+    return buffer.getvalue()

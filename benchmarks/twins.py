@@ -1,0 +1,192 @@
+"""Measure how far verdicts on renders hold for photographs, on data that you have.
+
+    python benchmarks/twins.py DATA --model MODEL --labels LABELS --out FOLDER
+    python benchmarks/twins.py DATA --train BACKBONE.pt2 --folds 5 --out FOLDER
+
+DATA is a folder in BOP's form, or a list. With --train a linear layer is fitted on what
+a backbone (an exported program: images in, numbers out) says of the crops of other
+frames. Frames are cut into blocks of neighbours; each block is judged by a classifier
+that was fitted on the others, and is a run of its own. Then the rows of all blocks are
+counted together. No data is in this repository.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.questions.twins import rendering, twins
+from advsearch.questions.twins.counting import make_table
+from advsearch.questions.twins.listing import PhotographedObject, read_photographs
+from advsearch.questions.twins.result import (
+    CLASSIFIER_MARGIN,
+    COMPOSED,
+    HOLE,
+    TwinRow,
+    make_agreement_part,
+)
+
+SIZE = (224, 224)
+N_COPIES = 12  # of each crop, shifted, scaled and lit at random
+N_STEPS = 300
+WEIGHT_DECAY = 1e-2
+MIN_VISIBLE = 0.1
+ALL_ROWS = 1000
+
+
+class Head(nn.Module):
+    """A linear layer on standardised features of a network."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, backbone: Any, features: Tensor, n_classes: int) -> None:
+        super().__init__()
+        self.backbone = backbone
+        self.register_buffer("mean", features.mean(dim=0))
+        self.register_buffer("std", features.std(dim=0) + 1e-3)
+        self.linear = nn.Linear(features.shape[1], n_classes)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.classify(self.backbone(images))
+
+    def classify(self, features: Tensor) -> Tensor:
+        """Return logits (N, classes) of features (N, n)."""
+        logits: Tensor = self.linear((features - self.mean) / self.std)
+        return logits
+
+
+def fit_head(backbone: Any, features: Tensor, labels: Tensor, n_classes: int) -> Head:
+    """Fit a linear layer on features (N, n) with labels (N,) by cross entropy."""
+    torch.manual_seed(0)
+    head = Head(backbone, features, n_classes)
+    optimizer = torch.optim.AdamW(
+        head.linear.parameters(), lr=1e-2, weight_decay=WEIGHT_DECAY
+    )
+    for _ in range(N_STEPS):
+        loss = F.cross_entropy(head.classify(features), labels)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return head.requires_grad_(False)
+
+
+def list_crops(
+    objects: Sequence[PhotographedObject], generator: np.random.Generator
+) -> Iterator[tuple[PhotographedObject, Tensor]]:
+    """Yield each object with its crop and changed copies of it, (N_COPIES, H, W, 3)."""
+    for item in objects:
+        if item.visible is not None and item.visible < MIN_VISIBLE:
+            continue
+        photograph = rendering.load_photograph(item.photograph)
+        positions = rendering.project_object(
+            item, rendering.load_object(item.mesh, item.unit)
+        )
+        images = []
+        for copy in range(N_COPIES):
+            margin = CLASSIFIER_MARGIN
+            moved = positions
+            gain = 1.0
+            if copy:
+                extent = float(np.ptp(positions, axis=0).max())
+                margin = float(generator.uniform(0.1, 0.5))
+                moved = positions + 0.08 * extent * generator.standard_normal(2)
+                gain = float(generator.uniform(0.6, 1.4))
+            window = rendering.choose_window(moved, photograph.shape[:2], SIZE, margin)
+            if window is None:
+                break
+            crop = rendering.resize(rendering.cut_window(photograph, window), SIZE)
+            images.append((crop * gain).clamp(0.0, 1.0))
+        if images:
+            yield item, torch.stack(images)
+
+
+def cut_frames(objects: Sequence[PhotographedObject], n_folds: int) -> list[list[str]]:
+    """Cut frames, in the order of the files, into blocks of neighbours."""
+    frames = list(dict.fromkeys(item.frame for item in objects))
+    return [list(block) for block in np.array_split(np.array(frames), n_folds)]
+
+
+def run_folds(options: argparse.Namespace) -> list[TwinRow]:
+    """Judge each block of frames by a classifier that was fitted on the others."""
+    objects = read_photographs(options.data).objects
+    names = sorted({item.object for item in objects})
+    backbone = torch.export.load(options.train).module().requires_grad_(False)
+    blocks = []
+    frames = []
+    labels = []
+    for item, images in list_crops(objects, np.random.default_rng(0)):
+        with torch.no_grad():
+            blocks.append(backbone(images.permute(0, 3, 1, 2).contiguous()))
+        frames += [item.frame] * len(images)
+        labels += [names.index(item.object)] * len(images)
+    features = torch.cat(blocks)
+    targets = torch.tensor(labels)
+    rows: list[TwinRow] = []
+    for number, block in enumerate(cut_frames(objects, options.folds)):
+        is_other = torch.tensor([frame not in block for frame in frames])
+        head = fit_head(backbone, features[is_other], targets[is_other], len(names))
+        accuracy = head.classify(features[~is_other]).argmax(1) == targets[~is_other]
+        print(f"fold {number}: right in {float(accuracy.float().mean()):.3f} of crops")
+        model = advsearch.load_model(
+            head, labels=names, input_size=SIZE, name=f"fold {number}"
+        )
+        result = twins(
+            options.data,
+            network=model,
+            frames=",".join(block),
+            pictures=ALL_ROWS,
+            environment=options.environment,
+            spp=options.spp,
+            run=str(options.out / f"fold-{number}"),
+            overwrite=True,
+        )
+        rows += [pair.row for pair in result.pairs]
+    return rows
+
+
+def run_model(options: argparse.Namespace) -> list[TwinRow]:
+    """Judge all photographs by one model."""
+    result = twins(
+        options.data,
+        model=options.model,
+        labels=options.labels,
+        pictures=ALL_ROWS,
+        environment=options.environment,
+        spp=options.spp,
+        run=str(options.out / "twins"),
+        overwrite=True,
+    )
+    return [pair.row for pair in result.pairs]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--train", type=Path)
+    parser.add_argument("--folds", type=int, default=5)
+    parser.add_argument("--model", default="reference")
+    parser.add_argument("--labels")
+    parser.add_argument("--environment", default="room")
+    parser.add_argument("--spp", type=int, default=32)
+    options = parser.parse_args()
+    rows = run_folds(options) if options.train else run_model(options)
+    surroundings = (COMPOSED, options.environment, HOLE)
+    part = make_agreement_part(
+        make_table(rows, surroundings, "folds", "classification")
+    )
+    for line in (part.heads, *part.rows):
+        print(" | ".join(line))
+
+
+if __name__ == "__main__":
+    main()
