@@ -114,7 +114,10 @@ LIST_SETTINGS = (
     "held_out_environment",
 )
 """The settings that may be several names, where a command takes several."""
-TEXT_SETTINGS = (*LIST_SETTINGS, "task", "up", "camera", "run", "objective")
+TEXT_SETTINGS = (
+    *LIST_SETTINGS,
+    *("task", "up", "camera", "backdrop", "run", "objective"),
+)
 """The settings that are texts, whatever they are given as."""
 # controls as they are asked for: their names, each with its settings
 ControlsByName = dict[str, dict[str, object]]
@@ -225,6 +228,16 @@ class SceneConfig(Config):
         "it, several with ; between them",
         flag="--with",
         otherwise="nothing",
+    )
+    backdrop: str | None = setting(
+        None,
+        "scene",
+        "a photograph that the object is rendered into, taken by the camera of the "
+        "scene",
+        "a picture file, or a part of it, photo.jpg#X,Y,WIDTH,HEIGHT in pixels",
+        metavar="FILE",
+        otherwise="the environment is behind the object",
+        min_length=1,
     )
     judge: str = setting(
         "object",

@@ -282,6 +282,8 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
                 "given to another mesh than the "
                 f"object; {able} can, as in pose:{control.name}"
             )
+    if scene.backdrop_photograph is not None:
+        _check_controls_in_photograph(controls, scene.backdrop_photograph.spec)
     described = scene
     adjusted = list[AdjustedDefault]()
     for control in controls:
@@ -314,6 +316,16 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
         else []
     )
     return Space(bound, scene, tuple(adjusted), lit_by[0] if lit_by else None)
+
+
+def _check_controls_in_photograph(controls: Sequence[Control], spec: str) -> None:
+    """Raise InputError if a control would not be true of what a photograph shows."""
+    for control in controls:
+        if control.photograph_refusal:
+            raise InputError(
+                f"`controls` {control.name} and `backdrop={spec}` contradict each "
+                f"other: {control.photograph_refusal}; leave one of the two out"
+            )
 
 
 def __getattr__(name: str) -> Any:

@@ -279,6 +279,8 @@ class Control:
             taken where there are several.
         competes_with_ambient: whether it throws light that ambient light weakens, see
             `ambient`.
+        photograph_refusal: why it would not be true of a scene that is rendered into a
+            photograph; empty if it is.
 
     Raises:
         UnknownNameError: no such parameter or choice.
@@ -295,6 +297,7 @@ class Control:
     travels: ClassVar[bool] = False
     competes_with_ambient: ClassVar[bool] = False
     amount: ClassVar[str | None] = None
+    photograph_refusal: ClassVar[str] = ""
     on_top: bool = False
     name: str
     scene: SceneDescription

@@ -64,6 +64,9 @@ class CameraControl(Control):
     """An orbit around the object, the lens, and the exposure."""
 
     kind = "camera"
+    photograph_refusal = (
+        "the photograph was taken from one place, through one lens, at one exposure"
+    )
     parameters = (
         *CAMERA[:-1],
         _moving(

@@ -53,6 +53,9 @@ class EnvironmentControl(Control):
     """
 
     kind = "environment"
+    photograph_refusal = (
+        "the photograph was taken in one light, and shows its own surroundings"
+    )
     parameters = (
         Parameter.named(
             "which",

@@ -39,6 +39,7 @@ class HazeControl(Control):
     """A uniform haze around camera and object: how dense it is, and its colour."""
 
     kind = "haze"
+    photograph_refusal = "haze would lie before the object and not before the rest"
     amount = "density"
     parameters = (
         Parameter.number(

@@ -257,6 +257,7 @@ class SkyControl(Control):
     """
 
     kind = "sky"
+    photograph_refusal = "the photograph was taken in one light, and shows its own sky"
     parameters = (
         _by_differences(
             "azimuth",

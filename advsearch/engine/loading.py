@@ -29,6 +29,7 @@ from advsearch.options import describe_value, format_things
 from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Float32Array, ObjectAsset
+from advsearch.scene.backdrop import BackdropPhotograph, fit_to_photograph
 from advsearch.scene.camera_model import make_bundled_models, make_pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
@@ -226,6 +227,7 @@ def load_scene(
     | Mapping[str, object]
     | Sequence[str | Mapping[str, object]]
     | None = None,
+    backdrop: str | Path | BackdropPhotograph | None = None,
 ) -> Scene:
     """Load a scene.
 
@@ -261,6 +263,9 @@ def load_scene(
             its left: a text such as "car@12,3.5,heading=180; person@6,-2", or a list of
             such texts or of mappings, {"object": "car", "x": 12, "y": 3.5, "heading":
             180}; `size` (metres), `name` and `label` are optional.
+        backdrop: a photograph that the scene is rendered into (docs/cameras.md): a
+            picture file, taken by `camera`; of a part of it,
+            ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of
@@ -288,9 +293,11 @@ def load_scene(
     )
     if camera is not None:
         description = description.with_camera(camera)
+    if backdrop is not None:
+        description = description.with_backdrop(backdrop)
     has_asset = any(
         asset is not None and not isinstance(asset, (str, Path))
-        for asset in (object, environment)
+        for asset in (object, environment, backdrop)
     )
     loaded = Scene(description, is_session_only=mitsuba_dict is not None or has_asset)
     return loaded if texture is None else loaded.with_texture(texture)
@@ -330,6 +337,7 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
     parts that these settings cannot name.
     """
     description = scene.description
+    photograph = description.backdrop_photograph
     return {
         "object": description.object_name,
         "environment": description.environment_name,
@@ -339,6 +347,7 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
         "unit": description.unit,
         "camera": _camera_setting(description),
         "things": description.things_spec or None,
+        "backdrop": photograph.spec if photograph is not None else None,
         "set": description.requested_values,
     }
 
@@ -365,10 +374,15 @@ def fit_camera(
         resolution: side, or (height, width), in pixels.
 
     Raises:
-        InputError: several cameras and drops on a lens.
+        InputError: several cameras and drops on a lens; or the scene is rendered into
+            a photograph of another shape.
     """
     height, width = _height_and_width(resolution)
     aspect = width / height
+    if description.backdrop_photograph is not None:
+        return fit_to_photograph(
+            description, description.backdrop_photograph, (height, width)
+        )
     camera_model = description.camera_model
     remarks = description.remarks
     if description.number("camera.drops") > 0.0:

@@ -67,7 +67,7 @@ def load_configured_scene(
 
 def make_scene_kwargs(config: SceneConfig) -> dict[str, Any]:
     """Return the keyword arguments of `load_scene` that a configuration states."""
-    names = ("up", "facing", "size", "unit", "camera", "things")
+    names = ("up", "facing", "size", "unit", "camera", "things", "backdrop")
     return {
         **{name: getattr(config, name) for name in names},
         "settings": collect_scene_parameters(config),
@@ -277,6 +277,7 @@ SCENE_SETTINGS = (
     "unit",
     "camera",
     "things",
+    "backdrop",
     "exposure",
     "object",
 )

@@ -148,6 +148,11 @@ HIDDEN_OFFSET = 1000.0
 class Assembly:
     """Turn the inputs of a space into those of `MitsubaScene`, for a scene's parts.
 
+    Args:
+        description: the scene.
+        resolution: height and width in pixels of the image, for a scene that is
+            rendered into a photograph; None leaves the photograph out.
+
     Attributes:
         is_object_hidden: put the object so far away that neither it nor its shadow is
             in the image. The bounds of a scene in which this was set once change the
@@ -156,7 +161,11 @@ class Assembly:
 
     is_object_hidden = False
 
-    def __init__(self, description: SceneDescription) -> None:
+    def __init__(
+        self,
+        description: SceneDescription,
+        resolution: tuple[int, int] | None = None,
+    ) -> None:
         self.meshes = {
             name: MovingMesh(part.mesh, part.to_world)
             for name, part in description.meshes.items()
@@ -167,6 +176,9 @@ class Assembly:
             if isinstance(part, (BeamLamp, LampGlass))
         ]
         self._photograph = description.photograph
+        self._backdrop: Tensor | None = None
+        if description.backdrop_photograph is not None and resolution is not None:
+            self._backdrop = description.backdrop_photograph.resample(resolution)
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps applied.
@@ -179,6 +191,8 @@ class Assembly:
             pose[1, 3] += HIDDEN_OFFSET
             inputs = {**inputs, name: pose}
         parameters = dict(inputs)
+        if self._backdrop is not None:
+            parameters["backdrop.color"] = self._backdrop
         for part in self._carried:  # what carries it may be moved or deformed
             parameters |= _move_carried(part, inputs)
         for name, mesh in self.meshes.items():

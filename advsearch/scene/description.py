@@ -29,6 +29,7 @@ from advsearch.scene.assets import (
     describe_size_doubts,
     with_size,
 )
+from advsearch.scene.backdrop import BackdropPhotograph, read_backdrop
 from advsearch.scene.camera_entries import (
     MAX_TABLETOP_SIZE,
     PRESETS,
@@ -120,8 +121,11 @@ class SceneDescription:
     # beside object, environment and ground: further meshes, lamps, haze
     parts: tuple[ScenePart, ...] = ()
     thin_lens: bool = False  # the camera has an aperture and a focus distance
-    # the environment may be hidden behind a plain colour (`backdrop.color`)
+    # the environment may be hidden behind a plain colour or a photograph
+    # (`backdrop.color`)
     backdrop: bool = False
+    # that it is rendered into; None for none
+    backdrop_photograph: BackdropPhotograph | None = None
     aspect: float = 1.0  # width over height of the picture
     # those with poses of their own, by name
     cameras: Mapping[str, PosedCamera] = field(default_factory=dict)
@@ -176,6 +180,48 @@ class SceneDescription:
     def without_ground(self) -> SceneDescription:
         """Return the scene without a table, a road or a place."""
         return with_requested_ground(self.with_values(ground__size=0.0))
+
+    def with_backdrop(
+        self, photograph: str | Path | BackdropPhotograph
+    ) -> SceneDescription:
+        """Return the scene as it is rendered into a photograph.
+
+        The camera of the scene is the one that took it. The photograph has a ground of
+        its own, and hides the environment, which keeps lighting the object.
+
+        Args:
+            photograph: a picture file; with the part to use behind its name,
+                ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels from the top left corner.
+
+        Raises:
+            FileFormatError: the file can not be used.
+            InputError: the part leaves the photograph; a ground was requested, there
+                are several cameras, or drops on the lens.
+        """
+        if not isinstance(photograph, BackdropPhotograph):
+            photograph = read_backdrop(photograph)
+        ground_settings = sorted(
+            name for name in self.requested if name.startswith("ground.")
+        )
+        if ground_settings:
+            raise InputError(
+                f"`backdrop={photograph.spec}` and `set` {ground_settings[0]} contradict "
+                "each other: the photograph shows a ground of its own; leave one of "
+                "the two out"
+            )
+        if self.rig:
+            raise InputError(
+                f"`backdrop={photograph.spec}` and `camera={self.rig_spec}` contradict "
+                "each other: a photograph was taken by one camera; name one of them, "
+                f"{self.rig_spec}#NAME"
+            )
+        if self.number("camera.drops") > 0.0:
+            raise InputError(
+                f"`backdrop={photograph.spec}` and `set` camera.drops contradict each "
+                "other: drops would show the photograph; leave one of the two out"
+            )
+        scene = replace(self, backdrop=True, backdrop_photograph=photograph)
+        return scene.without_ground()
 
     @staticmethod
     def load_object(spec: str | Path) -> ObjectAsset:

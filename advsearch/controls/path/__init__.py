@@ -500,6 +500,13 @@ class PathControl(Control):
                 f"its camera {scene.camera!r}; give "
                 f"moves=object, or have it seen by 'orbit'"
             )
+        photograph = scene.backdrop_photograph
+        if CAMERA in self._movers and photograph is not None:
+            raise InputError(
+                f"`controls` {self.name} and `backdrop={photograph.spec}` contradict "
+                "each other: the photograph was taken from one place; give "
+                "moves=object, or leave one of the two out"
+            )
         self._check_needless()
         in_scene = self.with_scene(scene)
         names = _split_paths(self.chosen["path"])

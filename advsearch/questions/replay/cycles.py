@@ -313,7 +313,9 @@ def _find_unsupported(description: SceneDescription) -> list[str]:
             unsupported.append(f"a surface of Mitsuba's own on the {name}")
     if description.thin_lens or description.camera_model:
         unsupported.append("a lens")
-    if description.backdrop:
+    if description.backdrop_photograph:
+        unsupported.append("a photograph behind the object")
+    elif description.backdrop:
         unsupported.append("a plain background")
     return unsupported
 

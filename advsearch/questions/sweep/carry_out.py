@@ -76,6 +76,7 @@ SCENE_SETTINGS = (
     "unit",
     "camera",
     "things",
+    "backdrop",
     "set_",
     "exposure",
 )

@@ -74,8 +74,9 @@ def project_object(item: PhotographedObject, asset: assets.ObjectAsset) -> Float
     Raises:
         InputError: a part of the object is behind the camera.
     """
-    points = (asset.mesh.vertices.astype(np.float64) * asset.extent) + _origin(asset)
-    points = points @ item.pose[:3, :3].T + item.pose[:3, 3]
+    to_camera = compute_mesh_to_camera(item, asset)
+    points = asset.mesh.vertices.astype(np.float64) @ to_camera[:3, :3].T
+    points += to_camera[:3, 3]
     if points[:, 2].min() <= 0.0:
         raise InputError(
             f"{item.photograph}: a part of {item.object} is behind the camera; check "
@@ -254,14 +255,26 @@ def choose_film(windows: Sequence[Window], pixel_aspect: float) -> tuple[int, in
     return max(1, round(height * scale)), max(1, round(largest.width * scale))
 
 
+def compute_mesh_to_camera(
+    item: PhotographedObject, asset: assets.ObjectAsset
+) -> Float64Array:
+    """Return the rigid map (4, 4) from a mesh to OpenCV's camera coordinates.
+
+    Both are in object sizes, which leaves the image as it is.
+    """
+    if asset.file_to_mesh is None:
+        raise InputError(f"{item.mesh}: expected a mesh file")
+    to_camera: Float64Array = item.pose @ np.linalg.inv(asset.file_to_mesh)
+    object_size = float(np.cbrt(np.linalg.det(to_camera[:3, :3])))
+    to_camera[:3] /= object_size
+    return to_camera
+
+
 def make_camera_inputs(
     item: PhotographedObject, asset: assets.ObjectAsset, window: Window
 ) -> dict[str, Tensor]:
     """Return the scene inputs of the camera that sees a window of a photograph."""
-    to_camera = item.pose.copy()
-    to_camera[:3, 3] = (item.pose[:3, :3] @ _origin(asset) + item.pose[:3, 3]) / (
-        asset.extent or 1.0
-    )
+    to_camera = compute_mesh_to_camera(item, asset)
     camera = item.camera
     to_world = np.linalg.inv(FLIP @ to_camera)
     tangent = max(window.width / camera.fx, window.height / camera.fy) / 2.0
@@ -386,10 +399,4 @@ def load_object(mesh: Path, unit: str) -> assets.ObjectAsset:
     """
     scene = workbench.load_scene(mesh, up="z", facing="+x", unit=unit)
     asset: assets.ObjectAsset = scene.description.object
-    if asset.extent is None or asset.origin is None:
-        raise InputError(f"{mesh}: expected a mesh file")
     return asset
-
-
-def _origin(asset: assets.ObjectAsset) -> Float64Array:
-    return np.array(asset.origin or (0.0, 0.0, 0.0))

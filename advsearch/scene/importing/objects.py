@@ -32,6 +32,7 @@ from advsearch.scene.assets import (
     ObjectAsset,
     find_footing,
     group_indices,
+    make_pose,
     normalise_mesh,
 )
 from advsearch.scene.importing import gltf, gltf_parts
@@ -258,23 +259,8 @@ def make_object(
         emission=_compute_emitted(maps.emission, opacity),
         metres=extent if has_unit else None,
         extent=extent,
-        origin=_find_origin(soup, parts, turn),
+        file_to_mesh=_compute_file_to_mesh(parts, soup, turn),
     )
-
-
-def _find_origin(
-    soup: Soup, parts: list[ImportedPart], turn: Float64Array
-) -> tuple[float, float, float]:
-    """Return the point of the file's coordinates below the middle of the object.
-
-    `turn` (3, 3) leads from the file's axes to those of the soup, which `join_parts`
-    made of the parts.
-    """
-    used = [part.vertices[np.unique(part.faces)] for part in parts]
-    lowest = np.min([points.min(axis=0) for points in used], axis=0)
-    footing, _ = find_footing(soup.points[np.unique(soup.faces)])
-    x, y, z = lowest + compute_extent(parts) * (turn.T @ footing)
-    return float(x), float(y), float(z)
 
 
 def _select_visible_parts(
@@ -376,6 +362,21 @@ def _make_mesh(
     )
     rig = SkeletonRig(movable_parts, stored_vertices, turn / size)
     return replace(normalised_mesh, rig=rig)
+
+
+def _compute_file_to_mesh(
+    parts: list[ImportedPart], soup: Soup, turn: Float64Array
+) -> Float64Array:
+    """Return the map (4, 4) from the file's coordinates to the normalised mesh's.
+
+    It is that of `join_parts` and `normalise_mesh` together; `turn` (3, 3) leads from
+    the file's axes to ours.
+    """
+    used = [part.vertices[np.unique(part.faces)] for part in parts]
+    low = np.min([points.min(axis=0) for points in used], axis=0)
+    origin, size = find_footing(soup.points[np.unique(soup.faces)])
+    linear = turn / (compute_extent(parts) * size)
+    return make_pose(linear, -linear @ low - origin / size)
 
 
 def _compute_emitted(

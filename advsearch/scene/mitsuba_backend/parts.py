@@ -533,7 +533,8 @@ def _make_lens(description: SceneDescription) -> Plugin:
             "leave one of the two out"
         )
     # a searched lens may fold
-    if description.backdrop and (model.black_fraction > 0.0 or not model.name):
+    has_plain_backdrop = description.backdrop and not description.backdrop_photograph
+    if has_plain_backdrop and (model.black_fraction > 0.0 or not model.name):
         raise InputError(
             "background: it would show where the camera's lens sees nothing as well; "
             "leave the plain background out, "

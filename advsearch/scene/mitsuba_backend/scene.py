@@ -115,7 +115,7 @@ class MitsubaScene:
             self.definition = (description, filter)
             self.resolution = resolution
             self.sampler = sampler
-            self.assembly = Assembly(description)
+            self.assembly = Assembly(description, resolution)
             self.max_depth = self.depth = max_depth
             self._leave_out = frozenset(leave_out)
             # Dr.Jit can record neither of these
@@ -131,11 +131,13 @@ class MitsubaScene:
             )
             self._backdrop = description.backdrop
             if description.backdrop and description.has_emission:
+                behind = "the plain background"
+                if description.backdrop_photograph is not None:
+                    behind = "the photograph"
                 raise InputError(
                     "background: Mitsuba hides surfaces that emit light together with "
-                    "the environment; leave the plain "
-                    "background out, or take an object and surroundings without "
-                    "emission"
+                    f"the environment; leave {behind} out, or take an object and "
+                    "surroundings without emission"
                 )
             self._guides: Plugin = {
                 "type": "aov",

@@ -1,0 +1,464 @@
+"""Photographs that a scene is rendered into, and the camera that took them.
+
+    display-linear = coverage * rendered + (1 - coverage) * photograph
+
+The photograph is read as a viewer shows it, decoded from sRGB, and averaged over the
+area of each pixel of the film. A part of it may be cut out, `photo.jpg#X,Y,WIDTH,HEIGHT`
+in pixels from its top left corner; the intrinsics of the camera follow.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from PIL import Image, ImageOps
+from torch import Tensor
+
+from advsearch.errors import FileFormatError, InputError
+from advsearch.pictures import check_decodable, opened, steps_of
+from advsearch.scene.assets import Float32Array, Float64Array, ObjectAsset
+from advsearch.scene.camera_model import (
+    BROWN_CONRADY,
+    EQUIRECTANGULAR,
+    LINEAR_PARAMETERS,
+    NUMBER_NAMES,
+    CameraModel,
+    make_bundled_models,
+    make_pinhole,
+)
+from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.importing.pictures import average_area
+from advsearch.trust.stored_files import LARGEST_FILE, reading
+
+if TYPE_CHECKING:
+    from advsearch.scene.description import SceneDescription
+
+MAX_ELEVATION = 89.0  # degrees, of a camera that orbits the object
+MIN_SIDE = 8  # pixels of a photograph, or of what is cut out of it
+# of an angle's cosine: how far from a rotation a matrix may be
+ROTATION_TOLERANCE = 1e-3
+# largest relative difference between the shapes of a photograph and of its camera
+SHAPE_TOLERANCE = 0.01
+PHOTOGRAPH_CAMERA = "photograph"  # name of the pinhole of a part of a photograph
+CROP = re.compile(r"(?P<path>.+)#(?P<numbers>\d+,\d+,\d+,\d+)")
+
+
+@dataclass(frozen=True, eq=False)
+class BackdropPhotograph:
+    """A photograph, or a part of one, that a scene is rendered into."""
+
+    spec: str  # how it was asked for: a path, and perhaps the part
+    levels: npt.NDArray[np.uint8]  # (H, W, 3) sRGB of the full photograph
+    digest: str  # SHA-256 of the levels, in hexadecimal
+    crop: tuple[int, int, int, int]  # left, top, width and height in pixels
+
+    @property
+    def full_size(self) -> tuple[int, int]:
+        """Height and width of the full photograph, pixels."""
+        return self.levels.shape[0], self.levels.shape[1]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the part that is used, pixels."""
+        return self.crop[3], self.crop[2]
+
+    @property
+    def is_cropped(self) -> bool:
+        return self.size != self.full_size
+
+    def resample(self, resolution: tuple[int, int]) -> Tensor:
+        """Return the part in display-linear values at (height, width) pixels.
+
+        Each pixel is the mean over the area that it covers, in linear light. Where the
+        photograph has fewer pixels than that, it is interpolated.
+
+        Returns:
+            (H, W, 3) float32 in [0, 1].
+        """
+        left, top, width, height = self.crop
+        levels = self.levels[top : top + height, left : left + width]
+        decoded = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
+        linear: Float32Array = decoded[levels]
+        averaged = average_area(
+            linear, min(height, resolution[0]), min(width, resolution[1])
+        )
+        image = torch.from_numpy(averaged)
+        if tuple(averaged.shape[:2]) == resolution:
+            return image
+        enlarged = torch.nn.functional.interpolate(
+            image.permute(2, 0, 1)[None],
+            size=resolution,
+            mode="bilinear",
+            align_corners=False,
+        )
+        return enlarged[0].permute(1, 2, 0).contiguous()
+
+
+def read_backdrop(spec: str | Path) -> BackdropPhotograph:
+    """Read a photograph that a scene is to be rendered into.
+
+    Args:
+        spec: a picture file; with the part to use behind it, ``#X,Y,WIDTH,HEIGHT``.
+
+    Raises:
+        FileFormatError: the file is missing, no picture, too large, corrupt, too small
+            or transparent.
+        InputError: the part leaves the photograph.
+    """
+    text = str(spec)
+    part = CROP.fullmatch(text)
+    path = Path(part["path"] if part else text)
+    with reading(path), opened(path, LARGEST_FILE) as image:
+        levels = _decode_photograph(image, path)
+    height, width = levels.shape[:2]
+    crop = (0, 0, width, height)
+    if part:
+        left, top, crop_width, crop_height = map(int, part["numbers"].split(","))
+        crop = (left, top, crop_width, crop_height)
+        if left + crop_width > width or top + crop_height > height:
+            raise InputError(
+                f"backdrop: {text} leaves the photograph, which has {width} x {height} "
+                "pixels (width x height); give a part inside it"
+            )
+    if min(crop[2:]) < MIN_SIDE:
+        raise InputError(
+            f"backdrop: expected at least {MIN_SIDE} x {MIN_SIDE} pixels of "
+            f"{path}, got {crop[2]} x {crop[3]}; take another photograph"
+        )
+    return make_backdrop(levels, text, crop)
+
+
+def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:
+    """Return the levels (H, W, 3) of an opened photograph, as a viewer shows it."""
+    check_decodable(image, path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of large images and odd metadata
+        image.load()
+        upright = ImageOps.exif_transpose(image)
+    if image.has_transparency_data and bool(
+        (steps_of(upright, alpha=True)[:, :, 3] < 255).any()
+    ):
+        raise FileFormatError(
+            f"{path}: expected a photograph, got a picture that is transparent in some "
+            "pixels; save it without transparency"
+        )
+    return np.ascontiguousarray(steps_of(upright, alpha=False))
+
+
+def make_backdrop(
+    levels: npt.NDArray[np.uint8],
+    spec: str = "photograph",
+    crop: tuple[int, int, int, int] | None = None,
+) -> BackdropPhotograph:
+    """Make a backdrop of 8-bit sRGB levels (H, W, 3).
+
+    Args:
+        levels: of the full photograph.
+        spec: how it is called.
+        crop: left, top, width and height in pixels of the part to use; None: all.
+
+    Raises:
+        InputError: the levels have another shape or type.
+    """
+    if levels.ndim != 3 or levels.shape[2] != 3 or levels.dtype != np.uint8:
+        raise InputError(
+            "backdrop: expected a photograph (h, w, 3) of uint8, got an array of shape "
+            f"{levels.shape} of {levels.dtype}"
+        )
+    levels = np.ascontiguousarray(levels)
+    digest = hashlib.sha256(f"{levels.shape}".encode() + levels.tobytes()).hexdigest()
+    height, width = levels.shape[:2]
+    return BackdropPhotograph(spec, levels, digest, crop or (0, 0, width, height))
+
+
+# ---- The camera of a photograph
+
+
+def make_matrix_camera(
+    camera_matrix: npt.ArrayLike, size: tuple[int, int]
+) -> CameraModel:
+    """Return the camera of an intrinsic matrix (3, 3), as OpenCV has it.
+
+    Args:
+        camera_matrix: in pixels; the center of the first pixel is (0, 0).
+        size: height and width in pixels of the photographs that it is for.
+
+    Raises:
+        InputError: it is no such matrix.
+    """
+    matrix = np.asarray(camera_matrix, np.float64)
+    has_form = (
+        matrix.shape == (3, 3)
+        and bool(np.isfinite(matrix).all())
+        and matrix[1, 0] == 0.0
+        and matrix[2].tolist() == [0.0, 0.0, 1.0]
+        and min(matrix[0, 0], matrix[1, 1]) > 0.0
+    )
+    if not has_form:
+        raise InputError(
+            "camera_matrix: expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in "
+            f"pixels, got {matrix.tolist()}"
+        )
+    height, width = size
+    linear = (
+        matrix[0, 0] / width,
+        matrix[1, 1] / height,
+        (matrix[0, 2] + 0.5) / width,
+        (matrix[1, 2] + 0.5) / height,
+        matrix[0, 1] / width,
+    )
+    n_coefficients = len(NUMBER_NAMES) - len(LINEAR_PARAMETERS)
+    numbers = (*map(float, linear), *[0.0] * n_coefficients)
+    return CameraModel(BROWN_CONRADY, numbers, PHOTOGRAPH_CAMERA, size)
+
+
+def fit_to_photograph(
+    description: SceneDescription,
+    photograph: BackdropPhotograph,
+    resolution: tuple[int, int],
+) -> SceneDescription:
+    """Return a scene with the camera of the part of a photograph that is used.
+
+    Args:
+        description: the scene, whose camera took the full photograph.
+        photograph: that it is rendered into.
+        resolution: height and width of the film, pixels.
+
+    Raises:
+        InputError: the film, or the camera's picture, has another shape than the
+            photograph.
+    """
+    _check_film(photograph, resolution)
+    full_height, full_width = photograph.full_size
+    full_aspect = full_width / full_height
+    model = description.camera_model
+    if model is not None:
+        model = make_bundled_models(full_aspect).get(model.name, model)
+        _check_camera_shape(photograph, model)
+    if photograph.is_cropped:
+        if model is None:
+            fov = description.number("camera.fov")
+            model = replace(make_pinhole(fov, full_aspect), name=PHOTOGRAPH_CAMERA)
+        model = crop_camera(model, photograph)
+    return replace(
+        description, aspect=resolution[1] / resolution[0], camera_model=model
+    )
+
+
+def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraModel:
+    """Return the camera that sees the used part of a photograph.
+
+    `model` is the camera of the full photograph. Raises InputError: it is a panorama.
+    """
+    if model.kind == EQUIRECTANGULAR:
+        raise InputError(
+            f"backdrop: {photograph.spec} is a part of a picture of {model.name}, which "
+            "shows all around; give the full photograph"
+        )
+    left, top, width, height = photograph.crop
+    full_height, full_width = photograph.full_size
+    values = model.values
+    values["fx"] *= full_width / width
+    values["skew"] *= full_width / width
+    values["cx"] = (values["cx"] * full_width - left) / width
+    values["fy"] *= full_height / height
+    values["cy"] = (values["cy"] * full_height - top) / height
+    numbers = tuple(values[name] for name in NUMBER_NAMES)
+    return replace(model, numbers=numbers, size=None)
+
+
+def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> None:
+    """Raise InputError if a film has another shape than the photograph.
+
+    Its sides may be rounded to pixels.
+    """
+    height, width = photograph.size
+    film_height, film_width = resolution
+    rounding = max(width / film_width, height / film_height)
+    if abs(film_width / film_height * height - width) <= rounding:
+        return
+    scale = min(width / film_width, height / film_height)
+    part_width = int(film_width * scale)
+    part_height = int(film_height * scale)
+    left = photograph.crop[0] + (width - part_width) // 2
+    top = photograph.crop[1] + (height - part_height) // 2
+    path = photograph.spec.partition("#")[0]
+    raise InputError(
+        f"backdrop: {photograph.spec} has {width} x {height} pixels (width x height) "
+        f"and the rendered picture {film_width} x {film_height}, which is another "
+        f"shape; give a part of the photograph, such as {path}#{left},{top},"
+        f"{part_width},{part_height}, or another `resolution`"
+    )
+
+
+def _check_camera_shape(photograph: BackdropPhotograph, model: CameraModel) -> None:
+    """Raise InputError if a camera takes pictures of another shape."""
+    if model.size is None:
+        return
+    height, width = photograph.full_size
+    camera_height, camera_width = model.size
+    stretch = camera_width * height / (camera_height * width)
+    if abs(stretch - 1.0) > SHAPE_TOLERANCE:
+        raise InputError(
+            f"backdrop: {photograph.spec.partition('#')[0]} has {width} x {height} "
+            f"pixels (width x height) and {model.name} is for {camera_width} x "
+            f"{camera_height}, which is another shape: the photograph was turned or "
+            "cropped; take it as the camera took it, and give the part to use behind "
+            "its name, photo.jpg#X,Y,WIDTH,HEIGHT"
+        )
+
+
+# ---- The pose of a photograph
+
+
+def compute_view_settings(
+    asset: ObjectAsset,
+    object_to_camera: npt.ArrayLike,
+    up: npt.ArrayLike | None = None,
+) -> dict[str, float]:
+    """Return the settings of the scene in which a camera sees the object in a pose.
+
+    The camera orbits a point on its axis at the depth of the object's center, and the
+    object is shifted and turned from where it would stand.
+
+    Args:
+        asset: the object, from a file whose unit is known.
+        object_to_camera: rigid (4, 4) from coordinates of the object's file to those of
+            the camera: x right, y down, z ahead, in the file's unit.
+        up: (3,) direction in the camera's coordinates that is up in the world; None:
+            the object's own up axis, so that it stands upright.
+
+    Returns:
+        Values of ``camera.azimuth``, ``camera.elevation``, ``camera.roll``,
+        ``camera.distance`` and ``pose.*``, for `load_scene(settings=)`.
+
+    Raises:
+        InputError: the object comes from no file, or its size in metres is not known;
+            the pose is not rigid, or puts the object behind the camera.
+    """
+    mesh_to_camera = _compute_mesh_to_camera(asset, object_to_camera)
+    vertices = asset.mesh.vertices.astype(np.float64)
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    center = mesh_to_camera[:3, :3] @ middle + mesh_to_camera[:3, 3]
+    distance = float(center[2])
+    if distance <= 0.0:
+        raise InputError("object_to_camera: puts the object behind the camera")
+    world_axes = _make_world_axes(
+        mesh_to_camera[:3, 2] if up is None else np.asarray(up, np.float64)
+    )
+    rotation = world_axes @ mesh_to_camera[:3, :3]
+    offset = world_axes @ (center - np.array([0.0, 0.0, distance]))
+    lowest = float(((vertices - middle) @ rotation.T)[:, 2].min())
+    return {
+        **_compute_orbit(world_axes),
+        "camera.distance": distance * (asset.metres or 1.0),
+        **_decompose_rotation(rotation),
+        "pose.x": float(offset[0]),
+        "pose.y": float(offset[1]),
+        # from where its lowest vertex would be on the ground
+        "pose.z": float(offset[2] + middle[2]) + lowest,
+    }
+
+
+def _compute_mesh_to_camera(
+    asset: ObjectAsset, object_to_camera: npt.ArrayLike
+) -> Float64Array:
+    """Return the map (4, 4) from a mesh to camera coordinates, both in object sizes.
+
+    Raises InputError as `compute_view_settings`.
+    """
+    pose = _check_rigid(object_to_camera)
+    if asset.file_to_mesh is None or asset.metres is None:
+        raise InputError(
+            f"{asset.name}: expected an object from a mesh file with a known unit, to "
+            "be seen in a measured pose; give `unit`, such as unit=mm"
+        )
+    mesh_to_file = np.linalg.inv(asset.file_to_mesh)
+    object_size = float(np.cbrt(np.linalg.det(mesh_to_file[:3, :3])))
+    mesh_to_camera: Float64Array = pose @ mesh_to_file
+    mesh_to_camera[:3] /= object_size
+    return mesh_to_camera
+
+
+def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
+    """Return the settings of a camera on an orbit, by world axes (3, 3).
+
+    They are rows in the camera's coordinates. Raises InputError: it looks straight up
+    or down.
+    """
+    outwards = -world_axes[:, 2]  # from the object to the camera
+    elevation = math.degrees(math.asin(min(max(float(outwards[2]), -1.0), 1.0)))
+    if abs(elevation) > MAX_ELEVATION:
+        raise InputError(
+            "object_to_camera: the camera looks straight up or down, more than "
+            f"{MAX_ELEVATION:g} degrees from level, which no camera does that orbits "
+            "the object; give another `up`"
+        )
+    level_left = np.array([outwards[1], -outwards[0], 0.0])
+    level_left /= np.linalg.norm(level_left)
+    upright = np.cross(-outwards, level_left)
+    left = -world_axes[:, 0]
+    return {
+        "camera.azimuth": math.degrees(math.atan2(outwards[1], outwards[0])),
+        "camera.elevation": elevation,
+        "camera.roll": math.degrees(math.atan2(left @ upright, left @ level_left)),
+    }
+
+
+def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
+    """Return a pose (4, 4) as float64. Raises InputError: it is not rigid."""
+    matrix = np.asarray(pose, np.float64)
+    is_rigid = (
+        matrix.shape == (4, 4)
+        and bool(np.isfinite(matrix).all())
+        and matrix[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+        and np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max()
+        <= ROTATION_TOLERANCE
+        and np.linalg.det(matrix[:3, :3]) > 0.0
+    )
+    if not is_rigid:
+        raise InputError(
+            "object_to_camera: expected a rotation and a translation as a (4, 4) "
+            f"matrix, got {matrix.tolist()}"
+        )
+    return matrix
+
+
+def _make_world_axes(up: Float64Array) -> Float64Array:
+    """Return world axes (3, 3), rows in camera coordinates, with z along `up`.
+
+    +x points from the object to the camera as far as that is level.
+    """
+    if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
+        raise InputError(f"up: expected a direction of three numbers, got {up!r}")
+    z_axis = up / np.linalg.norm(up)
+    towards_camera = np.array([0.0, 0.0, -1.0])
+    x_axis = towards_camera - (towards_camera @ z_axis) * z_axis
+    if np.linalg.norm(x_axis) < 1e-6:  # the camera looks straight up or down
+        x_axis = np.array([0.0, 1.0, 0.0]) - z_axis[1] * z_axis
+    x_axis /= np.linalg.norm(x_axis)
+    return np.stack([x_axis, np.cross(z_axis, x_axis), z_axis])
+
+
+def _decompose_rotation(rotation: Float64Array) -> dict[str, float]:
+    """Return the settings of `Rz(yaw) Ry(pitch) Rx(roll)`, degrees."""
+    pitch = math.asin(min(max(-float(rotation[2, 0]), -1.0), 1.0))
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    roll = math.atan2(rotation[2, 1], rotation[2, 2])
+    if abs(rotation[2, 0]) > 1.0 - 1e-9:  # yaw and roll turn about one axis
+        yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
+        roll = 0.0
+    return {
+        "pose.yaw": math.degrees(yaw),
+        "pose.pitch": math.degrees(pitch),
+        "pose.roll": math.degrees(roll),
+    }

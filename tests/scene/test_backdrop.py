@@ -1,0 +1,237 @@
+"""Photographs behind the object: what is composed, which camera sees it, and what is refused."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import advsearch
+from advsearch.engine.loading import Scene, fit_camera
+from advsearch.errors import FileFormatError, InputError
+from advsearch.scene.backdrop import (
+    compute_view_settings,
+    make_backdrop,
+    make_matrix_camera,
+    read_backdrop,
+)
+from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.geometry import camera_to_world, project_points
+
+SIZE = (24, 32)
+
+
+def write_photograph(path: Path, size: tuple[int, int] = SIZE, **save: object) -> np.ndarray:
+    levels = np.random.default_rng(3).integers(0, 256, (*size, 3), dtype=np.uint8)
+    Image.fromarray(levels).save(path, **save)
+    return levels
+
+
+def decode(levels: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1, written out once more in float64."""
+    display = levels.astype(np.float64) / 255.0
+    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+
+
+def encode(linear: np.ndarray) -> np.ndarray:
+    clipped = np.clip(linear, 0.0, 1.0)
+    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+
+
+@pytest.fixture(scope="module")
+def photograph(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("photographs") / "desk.png"
+    write_photograph(path)
+    return path
+
+
+@pytest.mark.medium
+def test_the_picture_is_the_object_over_the_photograph_by_its_coverage(photograph: Path) -> None:
+    scene = advsearch.load_scene("mug", backdrop=photograph, settings={"camera.exposure": 0.5})
+    render = scene.renderer("texture", resolution=SIZE, denoise="none")
+    picture = render(render.start, seed=4, spp=16).detach().numpy()
+    inputs = render.compute_scene_inputs(render.start)
+    rgba = render.render_radiance(inputs, 4, 16, True).detach().double().numpy()
+    coverage = rgba[..., 3:]
+    assert 0.05 < coverage.mean() < 0.7 and ((coverage > 0.1) & (coverage < 0.9)).sum() > 10
+    behind = decode(np.asarray(Image.open(photograph)))
+    expected = encode(render.formation.gain * rgba[..., :3] + (1.0 - coverage) * behind)
+    np.testing.assert_allclose(picture, expected, atol=2e-6)
+    away = coverage[..., 0] == 0.0
+    levels = np.round(picture * 255.0).astype(int)
+    assert (levels[away] == np.asarray(Image.open(photograph))[away]).all(), "it is left as it is, bit for bit"
+
+
+@pytest.mark.medium
+def test_the_derivative_in_a_photograph_is_that_of_differences(photograph: Path) -> None:
+    scene = advsearch.load_scene("mug", backdrop=photograph, settings={"camera.exposure": -1.0})
+    render = scene.renderer({"texture": {"resolution": 4}}, resolution=SIZE, denoise="none")
+    weights = torch.linspace(0.5, 1.0, SIZE[1])[None, :, None] * torch.tensor([1.0, -0.5, 0.7])
+    u = (0.25 + 0.5 * torch.rand(len(render.start), generator=torch.Generator().manual_seed(2))).requires_grad_()
+    direction = torch.randn(len(u), generator=torch.Generator().manual_seed(5))
+    (weights * render(u, 1, 256)).sum().backward()
+    assert u.grad is not None
+    step = 0.02
+    with torch.no_grad():
+        ends = [(weights * render((u + sign * step * direction).clamp(0, 1), 1, 256)).sum() for sign in (1.0, -1.0)]
+    difference = float(ends[0] - ends[1]) / (2.0 * step)
+    assert float(u.grad @ direction) == pytest.approx(difference, rel=0.02)
+
+
+def test_a_photograph_is_averaged_in_linear_light(tmp_path: Path) -> None:
+    levels = write_photograph(tmp_path / "a.png", (12, 20))
+    got = read_backdrop(tmp_path / "a.png").resample((6, 10)).numpy()
+    expected = decode(levels).reshape(6, 2, 10, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(got, expected, atol=1e-6)
+    larger = read_backdrop(tmp_path / "a.png").resample((24, 40)).numpy()
+    assert larger.shape == (24, 40, 3) and larger.mean() == pytest.approx(decode(levels).mean(), abs=2e-3)
+
+
+def test_a_part_is_seen_by_the_camera_of_the_photograph(tmp_path: Path) -> None:
+    """The points of the object lie where the camera of the full photograph has them, less the part's corner."""
+    write_photograph(tmp_path / "a.png", (240, 320))
+    (tmp_path / "cam.yaml").write_text(
+        "image_width: 640\nimage_height: 480\ncamera_matrix: [500, 0, 330, 0, 510, 200, 0, 0, 1]\n"
+        "distortion_coefficients: [0.1, 0.02, 0.001, 0.002]\n"
+    )
+    points = torch.tensor([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.5], [0.0, 0.0, 2.0]], dtype=torch.float64)
+    places = {}
+    for name, spec, size in (("all", "a.png", (240, 320)), ("part", "a.png#40,20,160,120", (60, 80))):
+        scene = load_description("mug").with_camera(str(tmp_path / "cam.yaml")).with_backdrop(tmp_path / spec)
+        fitted = fit_camera(scene, size)
+        pixels, _ = project_points(fitted, {}, points, size)
+        places[name] = pixels.numpy() + np.array(size[::-1]) / 2.0
+    np.testing.assert_allclose(places["part"] * 2.0, places["all"] - [40, 20], atol=1e-9)
+    # without a camera file the field of view is that of the full photograph
+    scene = load_description("mug", given={"camera.fov": 50.0})
+    plain, _ = project_points(fit_camera(scene, (240, 320)), {}, points, (240, 320))
+    part = fit_camera(scene.with_backdrop(tmp_path / "a.png#40,20,160,120"), (120, 160))
+    pixels, _ = project_points(part, {}, points, (120, 160))
+    np.testing.assert_allclose(pixels.numpy() + np.array([80, 60]), plain.numpy() + np.array([120, 100]), atol=1e-9)
+
+
+def write_tetrahedron(path: Path) -> np.ndarray:
+    corners = np.array([[10.0, 0, 5], [50, 2, 3], [20, 40, 9], [25, 15, 70]])
+    faces = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)]
+    lines = [*(f"v {x} {y} {z}" for x, y, z in corners), *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces)]
+    path.write_text("\n".join(lines) + "\n")
+    return corners
+
+
+@pytest.mark.parametrize("up", [None, (0.1, -0.9, -0.3), (0.5, -0.2, -0.6)])
+def test_a_measured_pose_puts_the_object_where_the_camera_matrix_has_it(
+    tmp_path: Path, up: tuple[float, float, float] | None
+) -> None:
+    corners = write_tetrahedron(tmp_path / "t.obj")
+    asset = load_description(str(tmp_path / "t.obj"), up="z", unit="mm").object
+    turn = np.linalg.qr(np.random.default_rng(7).normal(size=(3, 3)))[0]
+    pose = np.eye(4)
+    pose[:3, :3] = turn * np.sign(np.linalg.det(turn))
+    pose[:3, 3] = [30.0, -20.0, 600.0]
+    matrix = np.array([[500.0, 0, 330], [0, 510, 200], [0, 0, 1]])
+    settings = compute_view_settings(asset, pose, up)
+    scene = load_description(asset, given=settings)
+    scene = replace(scene, camera_model=make_matrix_camera(matrix, (480, 640)))
+    camera = camera_to_world(scene, 640 / 480)
+    relative = (scene.base_vertices - camera[:3, 3]) @ camera[:3, :3]
+    pixels, _ = project_points(scene, {}, torch.from_numpy(relative), (480, 640))
+    seen = corners @ pose[:3, :3].T + pose[:3, 3]
+    image = seen @ matrix.T
+    expected = image[:, :2] / image[:, 2:] + 0.5  # the centre of OpenCV's first pixel is (0, 0)
+    got = pixels.numpy() + np.array([320, 240])
+    distance = np.linalg.norm(got[:, None] - expected[None], axis=2)
+    assert distance.min(axis=1).max() < 5e-3 and distance.min(axis=0).max() < 5e-3
+    depth = np.unique(np.round(relative[:, 2] * scene.metres * 1e3, 2))
+    np.testing.assert_allclose(depth, np.sort(seen[:, 2]), atol=0.02)
+    if up is not None:
+        axes = camera[:3, :3] @ np.diag([-1.0, -1.0, 1.0])  # columns: right, down and ahead in the world
+        np.testing.assert_allclose(axes @ (np.array(up) / np.linalg.norm(up)), [0, 0, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("pose", "words"),
+    [
+        (2.0 * np.eye(4), "rotation and a translation"),
+        (np.eye(3), "rotation and a translation"),
+        (np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -900], [0, 0, 0, 1]]), "behind the camera"),
+    ],
+)
+def test_no_pose_of_an_object_is_refused(tmp_path: Path, pose: np.ndarray, words: str) -> None:
+    write_tetrahedron(tmp_path / "t.obj")
+    asset = load_description(str(tmp_path / "t.obj"), up="z", unit="mm").object
+    with pytest.raises(InputError, match=words):
+        compute_view_settings(asset, pose)
+
+
+def test_an_object_without_a_file_has_no_measured_pose() -> None:
+    with pytest.raises(InputError, match="mesh file with a known unit"):
+        compute_view_settings(load_description("mug").object, np.eye(4))
+
+
+# ---- what is refused
+
+
+def refuse(match: str, scene: SceneDescription, spec: str | Path, size: tuple[int, int] = SIZE) -> None:
+    with pytest.raises((InputError, FileFormatError), match=match):
+        fit_camera(scene.with_backdrop(spec), size)
+
+
+def test_hostile_photographs_are_refused_in_a_sentence(tmp_path: Path) -> None:
+    scene = load_description("mug")
+    write_photograph(tmp_path / "a.png")
+    data = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "cut.png").write_bytes(data[: len(data) // 2])
+    (tmp_path / "text.jpg").write_text("no photograph")
+    (tmp_path / "folder.png").mkdir()
+    header = b"IHDR" + (20000).to_bytes(4, "big") + (9000).to_bytes(4, "big") + data[24:29]
+    (tmp_path / "huge.png").write_bytes(data[:12] + header + zlib.crc32(header).to_bytes(4, "big") + data[33:])
+    Image.new("RGBA", (32, 24), (255, 0, 0, 128)).save(tmp_path / "clear.png")
+    Image.new("RGB", (4, 3)).save(tmp_path / "small.png")
+    for name in ("cut.png", "text.jpg", "folder.png", "nowhere.png"):
+        refuse("expected a picture file", scene, tmp_path / name)
+    refuse("pixels", scene, tmp_path / "huge.png")
+    refuse("transparent in some pixels", scene, tmp_path / "clear.png")
+    refuse("at least 8 x 8", scene, tmp_path / "small.png")
+    refuse("leaves the photograph", scene, f"{tmp_path / 'a.png'}#20,0,20,20")
+    refuse("another shape", scene, tmp_path / "a.png", (32, 32))
+
+
+def test_a_wrong_suffix_sixteen_bits_and_a_turned_photograph_are_read_as_a_viewer_shows_them(tmp_path: Path) -> None:
+    levels = write_photograph(tmp_path / "a.png")
+    (tmp_path / "a.jpg").write_bytes((tmp_path / "a.png").read_bytes())
+    assert (read_backdrop(tmp_path / "a.jpg").levels == levels).all()
+    assert read_backdrop(tmp_path / "a.jpg").digest == read_backdrop(tmp_path / "a.png").digest
+    grey = (np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) * 85).astype(np.uint16)
+    Image.fromarray(grey).save(tmp_path / "grey.png")
+    expected = np.round(grey.astype(np.float64) / 65535.0 * 255.0)
+    assert np.abs(read_backdrop(tmp_path / "grey.png").levels[..., 0] - expected).max() <= 1
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned by 90 degrees clockwise
+    Image.fromarray(levels).save(tmp_path / "turned.png", exif=exif)
+    turned = read_backdrop(tmp_path / "turned.png")
+    assert turned.full_size == (32, 24) and (turned.levels == np.rot90(levels, -1)).all()
+
+
+def test_a_camera_of_another_shape_several_cameras_and_a_ground_are_refused(tmp_path: Path) -> None:
+    write_photograph(tmp_path / "a.png")
+    (tmp_path / "cam.yaml").write_text("image_width: 480\nimage_height: 640\nfx: 500\nfy: 500\ncx: 240\ncy: 320\n")
+    scene = load_description("mug")
+    refuse("was turned or cropped", scene.with_camera(str(tmp_path / "cam.yaml")), tmp_path / "a.png")
+    refuse("ground of its own", load_description("mug", given={"ground.size": 4.0}), tmp_path / "a.png")
+    refuse("drops would show", load_description("mug", given={"camera.drops": 5.0}), tmp_path / "a.png")
+    part = scene.with_camera("equirectangular")
+    refuse("shows all around", part, f"{tmp_path / 'a.png'}#0,0,16,12", (12, 16))
+    with pytest.raises(InputError, match="uint8"):
+        make_backdrop(np.zeros((24, 32, 3)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("control", ["camera", "environment", "sky", "haze", "background", "path"])
+def test_controls_that_the_photograph_contradicts_are_refused(photograph: Path, control: str) -> None:
+    scene = Scene(load_description("mug").with_backdrop(photograph))
+    with pytest.raises(InputError, match=f"{control} and `backdrop=.*contradict each other: .*leave one"):
+        scene.renderer(control, resolution=SIZE)
