@@ -201,11 +201,8 @@ class ObjectAsset(Shape):
     # its largest extent, where distances of the camera are in metres (see below)
     metres: float | None = None
     extent: float | None = None  # its largest extent in the coordinates of its file
-<<<<<<< HEAD
-=======
     # (4, 4) from the coordinates of its file to those of `mesh`
     file_to_mesh: Float64Array | None = None
->>>>>>> w-e
     # in a lane it faces as the traffic drives; otherwise it faces those who come, as
     # signs do
     drives: bool = True
