@@ -50,7 +50,7 @@ LIST_KEYS = (
 """What a row of a list may have; the first three it must."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Pinhole:
     """A camera without distortion, in pixels from the corner of the photograph."""
 
