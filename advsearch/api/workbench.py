@@ -111,6 +111,8 @@ from advsearch.runs.results import AxisValue as AxisValue
 from advsearch.runs.store import Row as Row
 from advsearch.runs.summary import read_configuration as read_configuration
 from advsearch.runs.tables import units_of as units_of
+from advsearch.runs.twins import find_twin_evidence as find_twin_evidence
+from advsearch.runs.twins import read_twins as read_twins
 from advsearch.scene import library as library
 from advsearch.scene.assembly import pose_mesh as pose_mesh
 from advsearch.scene.camera_files import read_camera as read_camera

@@ -10,16 +10,19 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from advsearch.options import NOT_A_NUMBER, Outcome, get_outcome
+from advsearch.runs.results import IN_PHOTOGRAPH, TwinMatch
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:
     from advsearch.runs.results import (
         ConditionRow,
         ControlGroup,
+        Estimate,
         Extent,
         Formation,
         Interval,
         SharedWork,
+        TwinEvidence,
         VerifiedRate,
     )
 
@@ -562,3 +565,61 @@ def share_text(extent: Extent) -> str:
         f"{extent.count} of {extent.total} ({share}, 95 % interval "
         f"{interval_text(extent.interval)})"
     )
+
+
+def estimate_text(estimate: Estimate | None, otherwise: str = "") -> str:
+    """Return a number with its interval: ``.96 (.94 to .98)``."""
+    if estimate is None:
+        return otherwise
+    text = _two_decimals(estimate.value)
+    if estimate.interval is None:
+        return text
+    lower, upper = map(_two_decimals, estimate.interval)
+    return f"{text} ({lower} to {upper})"
+
+
+def _two_decimals(value: float) -> str:
+    text = f"{value:.2f}"
+    return text.replace("0.", ".", 1) if abs(value) < 0.995 else text
+
+
+def twins_text(evidence: TwinEvidence) -> str:
+    """Return in a sentence or two how far a verdict holds for photographs."""
+    name = PurePath(evidence.run).name
+    row = evidence.row
+    if row is None:
+        return (
+            f"How far this holds for photographs was not measured: "
+            f"{_TWIN_MISMATCHES[evidence.match].format(run=name)}."
+        )
+    of_objects = row.object or "all objects together"
+    if not evidence.same_object:
+        of_objects += ", not of this object"
+    surroundings = f"in the environment {row.surroundings}"
+    if row.surroundings == IN_PHOTOGRAPH:
+        surroundings = "composed over their photographs"
+    if not evidence.same_surroundings:
+        surroundings += ", not in these surroundings"
+    agreement = (
+        f"Photographs ({name}; {of_objects}; renders {surroundings}): this model was "
+        f"right or wrong on both in {estimate_text(row.agreement)} of "
+        f"{count(row.pairs, 'pair')} of {count(row.frames, 'frame')}."
+    )
+    failing = f"{row.both_wrong} of {row.wrong_twins}"
+    if row.wrong_where_twin_wrong is None:
+        return (
+            f"{agreement} Too few renders failed to state how often a failing render "
+            f"is a failing photograph ({failing})."
+        )
+    return (
+        f"{agreement} A failing render was a failing photograph in "
+        f"{estimate_text(row.wrong_where_twin_wrong)} ({failing}); photographs failed "
+        f"in {estimate_text(row.photo_wrong)} at all."
+    )
+
+
+_TWIN_MISMATCHES = {
+    TwinMatch.NOTHING: "{run} compared nothing",
+    TwinMatch.OTHER_MODEL: "{run} is of another model",
+    TwinMatch.OTHER_TASK: "{run} is of another task",
+}

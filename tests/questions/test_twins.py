@@ -1,4 +1,4 @@
-"""`advsearch twins`: reading photographs with poses, rendering their twins, counting. Photographs: scenes/photographs."""
+"""`advsearch twins`: reading photographs with poses, rendering their twins, and counting."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,11 @@ from advsearch.questions.twins import counting, rendering
 from advsearch.questions.twins.carry_out import parse_frames
 from advsearch.questions.twins.listing import Pinhole, read_photographs
 from advsearch.questions.twins.result import COMPOSED, HOLE, TwinPrediction, TwinRow, TwinsResult
+from advsearch.report import wording
+from advsearch.report.views import remarks_of, shown
+from advsearch.runs import twins as runs_twins
+from advsearch.runs.results import IN_PHOTOGRAPH, WITHOUT_OBJECT, Estimate, TwinAgreement, TwinEvidence, TwinMatch
+from small_models import SMALL_ATTACK
 
 PHOTOGRAPHS = Path(__file__).resolve().parents[2] / "scenes" / "photographs"
 SCENE = PHOTOGRAPHS / "test" / "000001"
@@ -127,6 +133,68 @@ def test_frames_are_chosen_by_names_and_ranges() -> None:
         parse_frames("1:x")
 
 
+@pytest.mark.medium
+def test_an_attack_states_what_the_run_of_twins_measured(compared: TwinsResult, tmp_path: Path) -> None:
+    """Beside the verdict: of the nearest conditions, or that nothing was measured."""
+    settings: dict[str, Any] = {**SMALL_ATTACK, "twins": compared.run, "label": "cup"}
+    model = advsearch.load_model(RedOrBlue(), labels=["cup", "box"], input_size=32)
+    summary = advsearch.attack("mug", model, environment="studio", **settings).summary
+    assert summary.twins is not None and summary.twins.row is not None
+    assert summary.twins.match is TwinMatch.MEASURED
+    assert summary.twins.row.surroundings == "studio" and summary.twins.same_surroundings
+    assert not summary.twins.same_object and not summary.twins.row.object
+    (remark,) = [text for text in remarks_of(summary, shown(summary)) if text.startswith("Photographs (")]
+    assert "12 pairs of 12 frames" in remark and "Too few renders failed" in remark
+    other = advsearch.load_model(RedOrBlue(), labels=["cup", "box"], input_size=32, name="other")
+    summary = advsearch.attack("mug", other, environment="studio", **settings).summary
+    assert summary.twins is not None and summary.twins.match is TwinMatch.OTHER_MODEL
+    assert any("was not measured" in text for text in remarks_of(summary, shown(summary)))
+
+
+def make_agreement(**changed: Any) -> TwinAgreement:
+    rate = Estimate(value=0.9, interval=(0.8, 0.95))
+    fields: dict[str, Any] = {
+        "model": "data/net.pt2", "task": "classification", "surroundings": IN_PHOTOGRAPH, "object": "", "condition": "",
+        "pairs": 80, "frames": 20, "wrong_photos": 8, "wrong_twins": 10, "both_wrong": 6, "photo_right": rate,
+        "twin_right": rate, "agreement": rate, "kappa": None, "margins": None,
+        "photo_wrong": Estimate(value=0.1, interval=(0.05, 0.2)),
+        "wrong_where_twin_wrong": Estimate(value=0.6, interval=(0.3, 0.85)),
+    }  # fmt: skip
+    return TwinAgreement(**{**fields, **changed})
+
+
+def test_the_nearest_conditions_are_those_of_object_and_surroundings(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = [
+        make_agreement(surroundings=surroundings, object=name)
+        for surroundings in (IN_PHOTOGRAPH, "room", WITHOUT_OBJECT)
+        for name in ("", "can")
+    ]
+    monkeypatch.setattr(runs_twins, "read_twins", lambda run: SimpleNamespace(table=table))
+
+    def find(object_name: str, environment: str, **more: Any) -> TwinEvidence:
+        evidence = runs_twins.find_twin_evidence(
+            "r", model="net.pt2", task="classification", object_name=object_name, environment=environment, **more
+        )
+        assert evidence is not None
+        return evidence
+
+    def describe(evidence: TwinEvidence) -> tuple[Any, ...]:
+        assert evidence.row is not None
+        return evidence.row.object, evidence.row.surroundings, evidence.same_object, evidence.same_surroundings
+
+    assert describe(find("models/can.ply", "room")) == ("can", "room", True, True)
+    assert describe(find("can", "studio")) == ("can", "room", True, False)
+    assert describe(find("can", "studio", in_photograph=True)) == ("can", IN_PHOTOGRAPH, True, True)
+    assert describe(find("mug", "room")) == ("", "room", False, True)
+    evidence = find("mug", "room", in_photograph=True)
+    text = wording.twins_text(evidence)
+    assert text == (
+        "Photographs (r; all objects together, not of this object; renders composed over their photographs): this "
+        "model was right or wrong on both in .90 (.80 to .95) of 80 pairs of 20 frames. A failing render was a failing "
+        "photograph in .60 (.30 to .85) (6 of 10); photographs failed in .10 (.05 to .20) at all."
+    )
+
+
 def make_row(frame: str, photo_right: bool, twin_right: bool) -> TwinRow:
     predictions = [
         TwinPrediction(surroundings=name, label="cup", probability=None, right=right, margin=1.0 if right else -1.0)
@@ -231,7 +299,9 @@ def test_a_wrong_row_of_a_list_is_refused(tmp_path: Path, message: str) -> None:
 def test_a_list_in_yaml_with_a_camera_file(tmp_path: Path) -> None:
     Image.new("RGB", (32, 16)).save(tmp_path / "a.png")
     (tmp_path / "a.ply").write_bytes((PHOTOGRAPHS / "models" / "obj_000002.ply").read_bytes())
-    camera = "image_width: 32\nimage_height: 16\ncamera_matrix: {rows: 3, cols: 3, data: [40, 0, 15, 0, 41, 7, 0, 0, 1]}"
+    camera = (
+        "image_width: 32\nimage_height: 16\ncamera_matrix: {rows: 3, cols: 3, data: [40, 0, 15, 0, 41, 7, 0, 0, 1]}"
+    )
     (tmp_path / "camera.yaml").write_text(camera, "utf-8")
     row = "{photograph: a.png, object: a.ply, camera: camera.yaml, pose: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 5]}"
     (tmp_path / "list.yaml").write_text(f"photographs:\n- {row}\n", "utf-8")

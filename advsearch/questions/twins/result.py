@@ -22,8 +22,8 @@ from advsearch.extend import (
 )
 
 PHOTOGRAPH = "photograph"
-COMPOSED = "twin in the photograph"
-HOLE = "photograph without the object"
+COMPOSED = results.IN_PHOTOGRAPH
+HOLE = results.WITHOUT_OBJECT
 CLASSIFIER_MARGIN = 0.25
 DETECTOR_MARGIN = 1.5
 
@@ -265,27 +265,12 @@ def find_row(
     return None
 
 
-def estimate_text(estimate: results.Estimate | None, otherwise: str = "") -> str:
-    """Return a number with its interval: ``.96 (.94 to .98)``."""
-    if estimate is None:
-        return otherwise
-    text = _decimals(estimate.value)
-    if estimate.interval is None:
-        return text
-    lower, upper = map(_decimals, estimate.interval)
-    return f"{text} ({lower} to {upper})"
-
-
-def _decimals(value: float) -> str:
-    return f"{value:.2f}".replace("0.", ".", 1) if abs(value) < 1.0 else f"{value:.2f}"
-
-
 def conditional_text(row: results.TwinAgreement) -> str:
     """Return how often the photograph is wrong where the twin is."""
     counts = f"{row.both_wrong} of {row.wrong_twins}"
     if row.wrong_where_twin_wrong is None:
         return f"too few wrong: {counts}"
-    return f"{estimate_text(row.wrong_where_twin_wrong)}, {counts}"
+    return f"{wording.estimate_text(row.wrong_where_twin_wrong)}, {counts}"
 
 
 HEADS = (
@@ -303,10 +288,10 @@ def _agreement_cells(row: results.TwinAgreement, name: str) -> list[str]:
     return [
         name,
         str(row.pairs),
-        estimate_text(row.twin_right),
-        estimate_text(row.agreement),
-        estimate_text(row.kappa, "too few wrong"),
-        estimate_text(row.margins),
+        wording.estimate_text(row.twin_right),
+        wording.estimate_text(row.agreement),
+        wording.estimate_text(row.kappa, "too few wrong"),
+        wording.estimate_text(row.margins),
         conditional_text(row),
     ]
 
@@ -315,8 +300,15 @@ def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
     """Return the table of all objects and conditions."""
     total = [row for row in table if not row.object and not row.condition]
     first = total[0]
-    photo = [PHOTOGRAPH, str(first.pairs), estimate_text(first.photo_right), "", "", ""]
-    photo.append(f"wrong at all: {estimate_text(first.photo_wrong)}")
+    photo = [
+        PHOTOGRAPH,
+        str(first.pairs),
+        wording.estimate_text(first.photo_right),
+        "",
+        "",
+        "",
+    ]
+    photo.append(f"wrong at all: {wording.estimate_text(first.photo_wrong)}")
     rows = [photo, *(_agreement_cells(row, _name_surroundings(row)) for row in total)]
     return ResultPart("How far twins hold", heads=HEADS, rows=rows, note=TABLE_NOTE)
 
@@ -351,7 +343,7 @@ def _factor_part(result: TwinsResult) -> ResultPart:
                 part.factor,
                 f"{bounds} {part.unit}".strip(),
                 f"{part.disagreeing} of {part.pairs}",
-                estimate_text(part.rate),
+                wording.estimate_text(part.rate),
             ]
         )
     return ResultPart(
@@ -404,13 +396,13 @@ def summarize_twins(table: Sequence[results.TwinAgreement]) -> str:
         f"Over {wording.count(composed.pairs, 'pair')} of "
         f"{wording.count(composed.frames, 'frame')}, the model says of the twin in the "
         f"photograph what it says of the photograph, right or wrong, in "
-        f"{estimate_text(composed.agreement)}."
+        f"{wording.estimate_text(composed.agreement)}."
     ]
     if composed.wrong_where_twin_wrong is not None:
         sentences.append(
             f"Where that twin is wrong, the photograph is wrong in "
-            f"{estimate_text(composed.wrong_where_twin_wrong)}, and in "
-            f"{estimate_text(composed.photo_wrong)} at all."
+            f"{wording.estimate_text(composed.wrong_where_twin_wrong)}, and in "
+            f"{wording.estimate_text(composed.photo_wrong)} at all."
         )
     else:
         sentences.append(
@@ -468,7 +460,7 @@ def make_twins_claims(result: TwinsResult) -> Iterator[views.Claim]:
         )
         statement = (
             f"{_name_surroundings(row)}: agrees with the photograph in "
-            f"{estimate_text(row.agreement)} of {wording.count(row.pairs, 'pair')} of "
+            f"{wording.estimate_text(row.agreement)} of {wording.count(row.pairs, 'pair')} of "
             f"{wording.count(row.frames, 'frame')}; photographs wrong where it is "
             f"wrong: {conditional_text(row)}."
         )
