@@ -35,7 +35,7 @@ from advsearch.questions.twins.result import (
 )
 
 SIZE = (224, 224)
-N_COPIES = 6  # of each crop, shifted, scaled and lit at random
+N_COPIES = 3  # of each crop, shifted, scaled and lit at random
 N_STEPS = 300
 WEIGHT_DECAY = 1e-2
 MIN_VISIBLE = 0.1
