@@ -13,6 +13,7 @@ counted together. No data is in this repository.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,47 +37,66 @@ from advsearch.questions.twins.result import (
 
 SIZE = (224, 224)
 N_COPIES = 3  # of each crop, shifted, scaled and lit at random
-N_STEPS = 300
-WEIGHT_DECAY = 1e-2
+N_CELLS = 3  # along each side of the grid that features are averaged over
+RIDGE = 1.0
+SHARPNESS = 5.0  # logits of a unit of the fitted targets, which are -1 and 1
 MIN_VISIBLE = 0.1
 ALL_ROWS = 1000
+
+
+class Features(nn.Module):
+    """The last residual sum of an exported network, averaged over a grid of cells."""
+
+    def __init__(self, program: torch.export.ExportedProgram) -> None:
+        super().__init__()
+        module: Any = program.module()
+        sums = [
+            node
+            for node in module.graph.nodes
+            if "add" in node.name and node.meta["val"].ndim == 4
+        ]
+        graph = torch.fx.Graph()
+        copied: dict[torch.fx.Node, torch.fx.Node] = {}
+        for node in module.graph.nodes:
+            copied[node] = graph.node_copy(node, copied.__getitem__)
+            if node is sums[-1]:
+                break
+        graph.output(copied[sums[-1]])
+        self.network = torch.fx.GraphModule(module, graph).requires_grad_(False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return F.adaptive_avg_pool2d(self.network(images), N_CELLS).flatten(1)
 
 
 class Head(nn.Module):
     """A linear layer on standardised features of a network."""
 
-    mean: Tensor
-    std: Tensor
-
-    def __init__(self, backbone: Any, features: Tensor, n_classes: int) -> None:
+    def __init__(self, backbone: Features, mean: Tensor, weight: Tensor) -> None:
         super().__init__()
         self.backbone = backbone
-        self.register_buffer("mean", features.mean(dim=0))
-        self.register_buffer("std", features.std(dim=0) + 1e-3)
-        self.linear = nn.Linear(features.shape[1], n_classes)
+        self.mean = nn.Buffer(mean)
+        self.weight = nn.Buffer(weight)
 
     def forward(self, images: Tensor) -> Tensor:
         return self.classify(self.backbone(images))
 
     def classify(self, features: Tensor) -> Tensor:
         """Return logits (N, classes) of features (N, n)."""
-        logits: Tensor = self.linear((features - self.mean) / self.std)
-        return logits
+        return SHARPNESS * ((features - self.mean) @ self.weight)
 
 
-def fit_head(backbone: Any, features: Tensor, labels: Tensor, n_classes: int) -> Head:
-    """Fit a linear layer on features (N, n) with labels (N,) by cross entropy."""
-    torch.manual_seed(0)
-    head = Head(backbone, features, n_classes)
-    optimizer = torch.optim.AdamW(
-        head.linear.parameters(), lr=1e-2, weight_decay=WEIGHT_DECAY
-    )
-    for _ in range(N_STEPS):
-        loss = F.cross_entropy(head.classify(features), labels)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    return head.requires_grad_(False)
+def fit_head(
+    backbone: Features, features: Tensor, labels: Tensor, n_classes: int
+) -> Head:
+    """Fit a linear layer on features (N, n) with labels (N,) by ridge regression."""
+    inputs = features.double()
+    mean = inputs.mean(dim=0)
+    scale = (inputs.std(dim=0) + 1e-3) * math.sqrt(inputs.shape[1])
+    scaled = (inputs - mean) / scale
+    targets = 2.0 * F.one_hot(labels, n_classes).double() - 1.0
+    kernel = scaled @ scaled.T + RIDGE * torch.eye(len(scaled))
+    weight = scaled.T @ torch.linalg.solve(kernel, targets) / scale[:, None]
+    return Head(backbone, mean.float(), weight.float())
 
 
 def list_crops(
@@ -119,7 +139,7 @@ def run_folds(options: argparse.Namespace) -> list[TwinRow]:
     """Judge each block of frames by a classifier that was fitted on the others."""
     objects = read_photographs(options.data).objects
     names = sorted({item.object for item in objects})
-    backbone = torch.export.load(options.train).module().requires_grad_(False)
+    backbone = Features(torch.export.load(options.train))
     blocks = []
     frames = []
     labels = []
