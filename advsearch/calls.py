@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from typing import Any, TypeVar
 
-from advsearch.errors import InputError, resembling
+from advsearch.errors import InputError, find_similar_names
 from advsearch.files import either
 from advsearch.options import describe_value
 
@@ -62,7 +62,7 @@ def make_unexpected_error(
             continue
         suggestions, reason = suggest_keyword(name, known)
         if not suggestions and name.lower() not in DEVICES:
-            suggestions = resembling(name, known)[:2]
+            suggestions = find_similar_names(name, known)[:2]
         hint = ""
         if suggestions:
             names = " or ".join(f"`{suggestion}`" for suggestion in suggestions)

@@ -387,10 +387,13 @@ class SceneConfig(Config):
         "a name (kept in runs/) or the path of a folder",
         otherwise="runs/OBJECT-CONTROL-NNN",
         min_length=1,
-        power=powers.place,
+        power=powers.describe_location,
     )
     overwrite: bool = setting(
-        False, "run", "replace a run that is already there", power=powers.replacing
+        False,
+        "run",
+        "replace a run that is already there",
+        power=powers.describe_overwrite,
     )
 
     @model_validator(mode="after")

@@ -16,7 +16,7 @@ import numpy as np
 Value = TypeVar("Value")
 
 
-def copied(value: Value) -> Value:
+def copy_value(value: Value) -> Value:
     """Return a copy of all tensors, with their graphs, and arrays in a value, and of
     the lists, mappings and dataclasses that hold them. Anything else is as it is, and
     so is a dataclass that `gives_copies` of what it holds (`Facts`) and a mapping that
@@ -30,23 +30,25 @@ def copied(value: Value) -> Value:
         copy_of_value = original.copy()
     elif isinstance(original, MutableMapping):
         copy_of_value = copy.copy(original)
-        copy_of_value.update({key: copied(inner) for key, inner in original.items()})
+        copy_of_value.update(
+            {key: copy_value(inner) for key, inner in original.items()}
+        )
     elif isinstance(original, MappingProxyType):
         copy_of_value = MappingProxyType(
-            {key: copied(inner) for key, inner in original.items()}
+            {key: copy_value(inner) for key, inner in original.items()}
         )
     elif isinstance(original, list):
         copy_of_value = copy.copy(original)
-        copy_of_value[:] = map(copied, original)
+        copy_of_value[:] = map(copy_value, original)
     elif isinstance(original, tuple):
-        copied_items = map(copied, original)
+        copied_items = map(copy_value, original)
         copy_of_value = (
             type(original)(*copied_items)
             if hasattr(original, "_fields")
             else type(original)(copied_items)
         )
     elif isinstance(original, SimpleNamespace):
-        copy_of_value = SimpleNamespace(**copied(vars(original)))
+        copy_of_value = SimpleNamespace(**copy_value(vars(original)))
     elif (
         is_dataclass(original)
         and not isinstance(original, type)
@@ -55,7 +57,7 @@ def copied(value: Value) -> Value:
         copy_of_value = copy.copy(original)
         for field in fields(original):
             object.__setattr__(
-                copy_of_value, field.name, copied(getattr(original, field.name))
+                copy_of_value, field.name, copy_value(getattr(original, field.name))
             )
     return copy_of_value  # type: ignore[no-any-return]
 
@@ -74,14 +76,14 @@ def hand_copies(kind: type, **argument_slices: slice) -> None:
     for name, argument_slice in argument_slices.items():
         method = vars(kind).get(name)
         if isinstance(method, FunctionType):
-            setattr(kind, name, _handing(method, argument_slice))
+            setattr(kind, name, _wrap_with_copies(method, argument_slice))
 
 
-def _handing(method: Callable[..., Any], which: slice) -> Callable[..., Any]:
+def _wrap_with_copies(method: Callable[..., Any], which: slice) -> Callable[..., Any]:
     @wraps(method)
     def handed(self: Any, *args: Any, **named: Any) -> Any:
         copied_args = [*args]
-        copied_args[which] = map(copied, copied_args[which])
-        return method(self, *copied_args, **copied(named))
+        copied_args[which] = map(copy_value, copied_args[which])
+        return method(self, *copied_args, **copy_value(named))
 
     return handed

@@ -17,8 +17,8 @@ FELL_SHORT = 3
 """Exit status of a command whose check fell short."""
 
 # least ratio of `difflib` at which a name, or a word of it, is spelled nearly alike
-SIMILAR = 0.6
-SIMILAR_WORD = 0.75
+MIN_SIMILARITY = 0.6
+MIN_WORD_SIMILARITY = 0.75
 
 
 class AdvsearchError(Exception):
@@ -43,7 +43,7 @@ class UnknownNameError(InputError):
         self, kind: str, name: str, known: Iterable[str], hint: str = ""
     ) -> None:
         names = sorted(known)
-        near = resembling(name, names)[:3]
+        near = find_similar_names(name, names)[:3]
         guess = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
         listed = ", ".join(names) or "none"
         more = f" {hint}" if hint else ""
@@ -89,30 +89,30 @@ class ClusterError(AdvsearchError):
     """Workers that cannot be reached, or that cannot do what they are given."""
 
 
-def resembling(name: str, known: Iterable[str]) -> list[str]:
+def find_similar_names(name: str, known: Iterable[str]) -> list[str]:
     """Return the known names that are like `name`, whatever their case, best first.
     First those with all of its words ("coffee mug" for "mug"; a plural s is no
     difference), then those with words that begin like them, then those that contain it;
     of equals, those with fewer other words, and with its last word last. Where there is
     none, those of nearly the same spelling, as a whole or in one word.
     """
-    query_words = _words(name)
+    query_words = _split_words(name)
     names = list(dict.fromkeys(known))
     ranks = {
         known: rank
         for known in names
-        if (rank := _rank(query_words, _words(known))) is not None
+        if (rank := _rank(query_words, _split_words(known))) is not None
     }
     if ranks:
         return sorted(ranks, key=ranks.__getitem__)
     matcher = difflib.SequenceMatcher(None, "", name.casefold())
-    similarities = {known: _similarity(matcher, known) for known in names}
+    similarities = {known: _compute_similarity(matcher, known) for known in names}
     return sorted(
         filter(similarities.get, names), key=lambda known: -similarities[known]
     )
 
 
-def _words(name: str) -> list[str]:
+def _split_words(name: str) -> list[str]:
     words = [word for word in re.split(r"[\W_]+", name.casefold()) if word]
     return [
         re.sub("(?<=ss|sh|ch)es$|(?<=[^s])s$", "", word) if len(word) > 3 else word
@@ -134,14 +134,14 @@ def _rank(query: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] |
     return (2, *preference) if "".join(query) in "".join(words) else None
 
 
-def _similarity(matcher: difflib.SequenceMatcher[str], name: str) -> float:
+def _compute_similarity(matcher: difflib.SequenceMatcher[str], name: str) -> float:
     """How near a name's spelling is to what was asked for, as a whole or in one word; 0
     where it is not.
     """
     best_ratio = 0.0
     for text, threshold in [
-        (name.casefold(), SIMILAR),
-        *((word, SIMILAR_WORD) for word in _words(name)),
+        (name.casefold(), MIN_SIMILARITY),
+        *((word, MIN_WORD_SIMILARITY) for word in _split_words(name)),
     ]:
         matcher.set_seq1(text)
         if (

@@ -23,10 +23,16 @@ from typing import Any, Generic, NamedTuple, TypeVar, get_args, get_type_hints
 
 from advsearch import registry, threads
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress, Stages, watcher
-from advsearch.report.views import Claim, ShownResult, result_figure, shown
-from advsearch.runs.directory import CONFIG, RunDirectory, begun, is_run, run_path
-from advsearch.runs.listing import finished
+from advsearch.progress import NullProgress, Progress, Stages, as_progress
+from advsearch.report.views import Claim, ShownResult, get_view, render_result_figure
+from advsearch.runs.directory import (
+    CONFIG,
+    RunDirectory,
+    create_before_work,
+    is_run,
+    locate_run,
+)
+from advsearch.runs.listing import is_finished
 from advsearch.runs.measurements import Measurements
 from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.runs.summary import read_result
@@ -90,7 +96,7 @@ class RunContext(ExitStack, Generic[Settings]):
         """The run directory. The first access creates it, so check everything that may
         be wrong before.
         """
-        return self.enter_context(RunDirectory.of(self.config, self.resumed))
+        return self.enter_context(RunDirectory.open(self.config, self.resumed))
 
     @cached_property
     def stages(self) -> Stages:
@@ -133,7 +139,7 @@ class RunContext(ExitStack, Generic[Settings]):
         """What measured times depend on: the processor's name, and the cores that this
         process may use.
         """
-        return {"cpu": threads.read_processor_name(), "cores": threads.cores()}
+        return {"cpu": threads.read_processor_name(), "cores": threads.count_cores()}
 
     def result(self, result_type: type[ResultType], **fields: Any) -> ResultType:
         """Return a result with the given fields and those that every result has.
@@ -178,7 +184,7 @@ def run_and_save(
         result = function(context)
         if not context.has_run:
             return result
-        for suffix, data in result_figure(shown(result)).items():
+        for suffix, data in render_result_figure(get_view(result)).items():
             write_bytes(
                 context.run.path / "images" / f"{context.config.command}.{suffix}", data
             )
@@ -204,7 +210,7 @@ def run_experiment(
     writes_run = resumed is None and getattr(config, "out", None) is None
     # The folder is made before heavy imports, so that a run that is stopped early can
     # be listed.
-    with begun(config) if writes_run else nullcontext(resumed) as folder:
+    with create_before_work(config) if writes_run else nullcontext(resumed) as folder:
         experiment: Experiment[Result] = registry.get_experiment(config.command)
         return experiment.run(config, progress=progress, resumed=folder)
 
@@ -214,9 +220,9 @@ def find_stopped_run(config: Config) -> Path | None:
     yet.
     """
     run, _ = config.run_location
-    if run is None or not is_run(run_path(run)):
+    if run is None or not is_run(locate_run(run)):
         return None
-    return run_path(run)
+    return locate_run(run)
 
 
 def run_part(
@@ -240,7 +246,7 @@ def run_part(
             config.model_copy(update={"run": str(folder), "overwrite": True}),
             progress=progress,
         )
-    if finished(folder):
+    if is_finished(folder):
         return read_result(folder)
     return run(
         type(config).from_yaml(folder / CONFIG, config.session_settings),
@@ -378,7 +384,7 @@ class Experiment(Generic[AnyResult]):
             config = make_config(self.settings, **config_values)
             resumed = find_stopped_run(config) if resume else None
             return self.run(
-                config, progress=watcher(progress), resumed=resumed, **arguments
+                config, progress=as_progress(progress), resumed=resumed, **arguments
             )
 
         signature = self._make_signature(own_arguments)

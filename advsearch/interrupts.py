@@ -18,7 +18,7 @@ from types import FrameType
 
 # seconds within which a second signal is the same Ctrl-C: programs pass on what the
 # terminal has sent to all
-ONE = 0.5
+DUPLICATE_SECONDS = 0.5
 
 
 class Interrupts:
@@ -29,12 +29,12 @@ class Interrupts:
     def __init__(self) -> None:
         self.count = self.handled = 0
         self.ended = False
-        self._last = -ONE
+        self._last = -DUPLICATE_SECONDS
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         before = self._last
         self._last = time.monotonic()
-        if self._last - before < ONE:
+        if self._last - before < DUPLICATE_SECONDS:
             return
         self.count += 1
         if not self.ended:
@@ -105,7 +105,11 @@ def _hear(ours: socket.socket, theirs: socket.socket) -> None:
         if signal.SIGINT not in ours.recv(64):
             continue
         now = time.monotonic()
-        if first is not None and now - first >= ONE and not INTERRUPTS.ended:
+        if (
+            first is not None
+            and now - first >= DUPLICATE_SECONDS
+            and not INTERRUPTS.ended
+        ):
             with suppress(OSError):
                 # bars hide the cursor
                 os.write(2, b"\x1b[?25h" * os.isatty(2) + b"advsearch: interrupted\n")

@@ -16,18 +16,20 @@ from PIL import Image, ImageOps
 
 from advsearch.errors import FileFormatError
 from advsearch.trust import stored_files
-from advsearch.trust.stored_files import scaled, too_large
+from advsearch.trust.stored_files import make_size_error, scale_limit
 
 FORMATS = ("BMP", "DDS", "GIF", "JPEG", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
 """Formats of pictures, as Pillow names them. Pillow knows more; for some (EPS) it runs
 other programs.
 """
-LARGEST_FILE = 1 << 28  # bytes of a file that `upright` reads, before `scaled`
-# of a picture (8192 x 8192), before `scaled`; decoded they take 4 bytes each
-LARGEST_PIXELS = 1 << 26
+MAX_FILE_BYTES = (
+    1 << 28
+)  # bytes of a file that `load_upright` reads, before `scale_limit`
+# of a picture (8192 x 8192), before `scale_limit`; decoded they take 4 bytes each
+MAX_PIXELS = 1 << 26
 # scans of a progressive JPEG, each of which takes as long to decode as a picture; usual
 # are ten
-MOST_SCANS = 64
+MAX_SCANS = 64
 
 
 @contextlib.contextmanager
@@ -44,14 +46,14 @@ def without_pillows_limit() -> Iterator[None]:
 
 
 def check_pixels(
-    path: Path | str, width: int, height: int, limit: int = LARGEST_PIXELS
+    path: Path | str, width: int, height: int, limit: int = MAX_PIXELS
 ) -> None:
     """Refuse a picture with too many pixels before it is decoded. Raises
-    FileFormatError where it has more than `limit`, before `scaled`.
+    FileFormatError where it has more than `limit`, before `scale_limit`.
     """
-    if width * height > scaled(limit):
-        expected = f"a picture of at most {scaled(limit):,} pixels"
-        raise too_large(path, expected, f"{width} x {height}")
+    if width * height > scale_limit(limit):
+        expected = f"a picture of at most {scale_limit(limit):,} pixels"
+        raise make_size_error(path, expected, f"{width} x {height}")
 
 
 def check_decodable(image: Image.Image, path: Path | str) -> None:
@@ -65,14 +67,16 @@ def check_decodable(image: Image.Image, path: Path | str) -> None:
             f"{path}: expected a picture such as PNG or JPEG, got "
             f"{image.format}; convert it"
         )
-    if image.format in ("JPEG", "MPO") and _scans(image) > scaled(MOST_SCANS):
-        raise too_large(
-            path, f"a JPEG of at most {scaled(MOST_SCANS)} scans", f"{_scans(image)}"
+    if image.format in ("JPEG", "MPO") and _count_scans(image) > scale_limit(MAX_SCANS):
+        raise make_size_error(
+            path,
+            f"a JPEG of at most {scale_limit(MAX_SCANS)} scans",
+            f"{_count_scans(image)}",
         )
 
 
 @contextlib.contextmanager
-def opened(path: Path, limit: int) -> Iterator[Image.Image]:
+def open_image(path: Path, limit: int) -> Iterator[Image.Image]:
     """Open a picture file of at most `limit` bytes for the block, which may decode it.
     Raises FileFormatError: it is missing, no ordinary file, no picture, too large or
     damaged.
@@ -90,22 +94,22 @@ def opened(path: Path, limit: int) -> Iterator[Image.Image]:
         ) from error
 
 
-def png_of(levels: npt.NDArray[np.uint8]) -> bytes:
+def encode_levels(levels: npt.NDArray[np.uint8]) -> bytes:
     file = io.BytesIO()
     Image.fromarray(levels).save(file, "PNG")
     return file.getvalue()
 
 
-def upright(path: Path, side: int) -> npt.NDArray[np.float32]:
+def load_upright(path: Path, side: int) -> npt.NDArray[np.float32]:
     """Read a picture as a viewer shows it, averaged down where it is larger than a
     longest side: (H, W, 3) float32 display-referred values in [0, 1], row 0 on top;
-    what is transparent is as if it were not. Raises FileFormatError: as for `opened`
+    what is transparent is as if it were not. Raises FileFormatError: as for `open_image`
     and `check_decodable`.
     """
-    with opened(path, LARGEST_FILE) as image:
+    with open_image(path, MAX_FILE_BYTES) as image:
         check_decodable(image, path)
         rotated = ImageOps.exif_transpose(image)
-        reduced = Image.fromarray(steps_of(rotated, alpha=False))
+        reduced = Image.fromarray(to_8bit_levels(rotated, alpha=False))
         if max(reduced.size) > side:
             reduced.thumbnail((side, side), Image.Resampling.BOX)
         values: npt.NDArray[np.float32] = np.asarray(reduced, np.float32) / np.float32(
@@ -114,7 +118,7 @@ def upright(path: Path, side: int) -> npt.NDArray[np.float32]:
         return values
 
 
-def steps_of(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
+def to_8bit_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
     """Return the (H, W, 3) colours of a decoded picture in 8 bits; with alpha, (H, W,
     4).
     """
@@ -135,7 +139,7 @@ def steps_of(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
     return steps if alpha else steps[:, :, :3]
 
 
-def _scans(image: Image.Image) -> int:
+def _count_scans(image: Image.Image) -> int:
     file = getattr(image, "fp", None)
     if file is None:
         return 0

@@ -98,13 +98,13 @@ class Stages:
         return time.perf_counter() - self._started
 
 
-Watched = Progress | bool | None
+ProgressOption = Progress | bool | None
 """Who watches, as a caller says it: True is a bar, False nobody, None a bar on a
 terminal.
 """
 
 
-def watcher(watched: Watched) -> Progress:
+def as_progress(watched: ProgressOption) -> Progress:
     """Return who is told how far it is: the watcher that was given, and nobody where
     none was.
     """
@@ -114,56 +114,56 @@ def watcher(watched: Watched) -> Progress:
 Function = TypeVar("Function", bound=Callable[..., Any])
 # seconds after which a stage is announced where there is no terminal; a shorter one is
 # not worth a line
-PATIENCE = 2.0
-MOST_BARS = 5  # stages that a terminal shows at once
-UPDATE = 0.2  # least seconds between two changes of a notebook's line
+ANNOUNCE_SECONDS = 2.0
+MAX_BARS = 5  # stages that a terminal shows at once
+MIN_UPDATE_SECONDS = 0.2  # least seconds between two changes of a notebook's line
 LINE_INTERVAL = 5.0
-LINE_SHARE = 0.1
+LINE_FRACTION = 0.1
 """Seconds between two lines where there is no terminal, and the share of a stage's time
 so far that they are at least.
 """
 
 
-def watched(
-    asked: Watched, written: Callable[[str], str] = str
+def open_progress(
+    requested: ProgressOption, written: Callable[[str], str] = str
 ) -> AbstractContextManager[Progress]:
-    """Return the progress that a call asked for, see `Watched`, for a `with` block.
+    """Return the progress that a call asked for, see `ProgressOption`, for a `with` block.
     `written` writes the settings that a text names as whoever reads it does. Raises
     InputError where something else was asked for.
     """
     stream = sys.stderr
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
-    if asked not in (None, True, False):
-        if not callable(getattr(asked, "stage", None)):
+    if requested not in (None, True, False):
+        if not callable(getattr(requested, "stage", None)):
             raise InputError(
-                f"progress: expected True, False, None or a Progress, got {asked!r:.80}"
+                f"progress: expected True, False, None or a Progress, got {requested!r:.80}"
             )
-        return nullcontext(asked)  # type: ignore[arg-type]
-    if asked and getattr(shell, "kernel", None) is not None:  # a notebook asks
+        return nullcontext(requested)  # type: ignore[arg-type]
+    if requested and getattr(shell, "kernel", None) is not None:  # a notebook asks
         return NotebookProgress(written)
-    if asked is not False and stream is not None and stream.isatty():
+    if requested is not False and stream is not None and stream.isatty():
         # behind a screen, which escapes all
         return BarProgress(getattr(stream, "stream", stream), written)
     return (
         LineProgress(stream, written)
-        if asked and stream is not None
+        if requested and stream is not None
         else nullcontext(NullProgress())
     )
 
 
-def shows_progress(function: Function) -> Function:
-    """Let a function with a keyword `progress` be called with what `watched` takes."""
+def with_progress_option(function: Function) -> Function:
+    """Let a function with a keyword `progress` be called with what `open_progress` takes."""
 
     @wraps(function)
-    def wrapper(*args: Any, progress: Watched = None, **keywords: Any) -> Any:
-        with watched(progress) as watcher:
+    def wrapper(*args: Any, progress: ProgressOption = None, **keywords: Any) -> Any:
+        with open_progress(progress) as watcher:
             return function(*args, progress=watcher, **keywords)
 
     return wrapper  # type: ignore[return-value]
 
 
 class LineProgress:
-    """Plain lines on a stream: what a stage is once it has lasted `PATIENCE` seconds,
+    """Plain lines on a stream: what a stage is once it has lasted `ANNOUNCE_SECONDS` seconds,
     then how far it is every `LINE_INTERVAL` seconds or more, inside a `with` block also
     of one that is silent; messages at once.
     """
@@ -175,18 +175,18 @@ class LineProgress:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._stream = stream
-        self._written = written
+        self._format_names = written
         self._clock = clock
         self._lock = threading.RLock()
         self._ended = threading.Event()
         self._name = ""
-        self._begin = ""
+        self._stage_title = ""
         self._info = ""
         self._total: int | None = None
         self._printed: float | None = None
         self._at_most = False
         self._done = 0
-        self._began = clock()
+        self._stage_started = clock()
 
     def stage(
         self,
@@ -200,43 +200,43 @@ class LineProgress:
             self._name = name
             self._total = total
             self._at_most = at_most
-            self._begin = name + (f": {self._written(hint)}" if hint else "")
+            self._stage_title = name + (f": {self._format_names(hint)}" if hint else "")
             self._done = 0
             self._info = ""
-            self._began = self._clock()
+            self._stage_started = self._clock()
             self._printed = None
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         with self._lock:
             self._done += n
-            self._info = info_text(info) if info else self._info
+            self._info = format_info(info) if info else self._info
         self.tick()
 
     def message(self, text: str) -> None:
         with self._lock:
-            self._print(self._written(text))
+            self._print(self._format_names(text))
 
     def tick(self) -> None:
         """Print a line if it is time for one."""
         with self._lock:
             now = self._clock()
             if self._printed is None:
-                if self._name and now - self._began >= PATIENCE:
+                if self._name and now - self._stage_started >= ANNOUNCE_SECONDS:
                     self._printed = now
-                    self._print(self._begin)
+                    self._print(self._stage_title)
             elif now - self._printed >= max(
-                LINE_INTERVAL, LINE_SHARE * (now - self._began)
+                LINE_INTERVAL, LINE_FRACTION * (now - self._stage_started)
             ):
                 self._printed = now
-                self._print(f"{self._name}: {self._far()}")
+                self._print(f"{self._name}: {self._format_state()}")
 
-    def _far(self) -> str:
+    def _format_state(self) -> str:
         """Return how far it is: ``12 of at most 40, 10 s, at most 25 s left, best
         0.31``.
         """
         done = self._done
         total = self._total
-        elapsed = self._clock() - self._began
+        elapsed = self._clock() - self._stage_started
         limit = "at most " if self._at_most else ""
         texts = []
         if total is not None:
@@ -280,10 +280,10 @@ class NotebookProgress(LineProgress):
 
     def tick(self) -> None:
         with self._lock:
-            if self._clock() - self._updated >= UPDATE:
+            if self._clock() - self._updated >= MIN_UPDATE_SECONDS:
                 self._updated = self._clock()
                 self._handle.update(
-                    {"text/plain": f"{self._name}, {self._far()}"}, raw=True
+                    {"text/plain": f"{self._name}, {self._format_state()}"}, raw=True
                 )
 
     def _print(self, text: str) -> None:
@@ -319,7 +319,7 @@ class BarProgress:
         self.bars = bars.Progress(
             *columns, console=Console(file=terminal), transient=True
         )
-        self._written = written
+        self._format_names = written
 
     def stage(
         self,
@@ -333,12 +333,12 @@ class BarProgress:
             self.bars.update(
                 task.id, total=max(task.completed, 1), completed=max(task.completed, 1)
             )
-        for task in self.bars.tasks[: 1 - MOST_BARS]:
+        for task in self.bars.tasks[: 1 - MAX_BARS]:
             self.bars.update(task.id, visible=False)
         if hint:
-            self._print(f"{name}: {self._written(hint)}", style="dim")
+            self._print(f"{name}: {self._format_names(hint)}", style="dim")
         self.bars.add_task(
-            escaped(name + (", at most" if at_most else "")), total=total, info=""
+            escape_text(name + (", at most" if at_most else "")), total=total, info=""
         )
 
     def advance(self, n: int = 1, **info: float | str) -> None:
@@ -346,14 +346,16 @@ class BarProgress:
             self.bars.update(
                 task.id,
                 advance=n,
-                info=escaped(info_text(info)) if info else task.fields["info"],
+                info=escape_text(format_info(info)) if info else task.fields["info"],
             )
 
     def message(self, text: str) -> None:
-        self._print(self._written(text))
+        self._print(self._format_names(text))
 
     def _print(self, text: str, **look: Any) -> None:
-        self.bars.console.print(escaped(text), markup=False, highlight=False, **look)
+        self.bars.console.print(
+            escape_text(text), markup=False, highlight=False, **look
+        )
 
     def __enter__(self) -> BarProgress:
         self.bars.start()
@@ -365,12 +367,12 @@ class BarProgress:
 
 def _seconds(seconds: float) -> str:
     # late, so that --help answers at once
-    from advsearch.report.wording import seconds_text
+    from advsearch.report.wording import format_seconds
 
-    return f"{seconds:.0f} s" if seconds < 99.5 else seconds_text(seconds)
+    return f"{seconds:.0f} s" if seconds < 99.5 else format_seconds(seconds)
 
 
-def info_text(info: dict[str, float | str]) -> str:
+def format_info(info: dict[str, float | str]) -> str:
     """Return ``best 0.31, epsilon 0.1``."""
     values = {
         name: f"{value:.3g}" if isinstance(value, float) else value
@@ -379,7 +381,7 @@ def info_text(info: dict[str, float | str]) -> str:
     return ", ".join(f"{name} {value}" for name, value in values.items())
 
 
-def escaped(text: str, encoding: str = "utf-8") -> str:
+def escape_text(text: str, encoding: str = "utf-8") -> str:
     """Return `text` with everything but line ends and tabs that a terminal would not
     show, or that would steer it, written as an escape: names in it are others'.
     """

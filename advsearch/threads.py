@@ -36,7 +36,7 @@ if "GOMP_SPINCOUNT" not in os.environ:
 _chosen: int | None = None
 
 
-def cores(quota: Path = _CPU_MAX) -> int:
+def count_cores(quota: Path = _CPU_MAX) -> int:
     """The number of cores this process may use: those it is pinned to, and no more than
     a container's quota allows. The file has the quota and its period in microseconds
     (control groups, version 2).
@@ -70,20 +70,23 @@ def read_processor_name(cpu_info: Path = _CPU_INFO) -> str:
 
 # of threads for each core: more only wait for each other, and somebody else's file may
 # ask for any number
-MOST = 4
+MAX_THREADS_PER_CORE = 4
 
 
 def configure(threads: int | None = None, *, rendering: bool = True) -> int:
     """Give Dr.Jit a number of threads and torch half as many, or all where nothing is
     rendered, now and (Dr.Jit) when Mitsuba is imported later; return the number that
-    Dr.Jit gets. At most `MOST` for each core are taken. None means what
+    Dr.Jit gets. At most `MAX_THREADS_PER_CORE` for each core are taken. None means what
     ``OMP_NUM_THREADS`` said when this module was imported, and without it every core
     that this process may use. Raises InputError: fewer than one thread was asked for.
     """
     global _chosen
     if threads is not None and threads < 1:
         raise InputError(f"threads: expected a number of at least 1, got {threads}")
-    _chosen = min(threads if threads is not None else _default(), MOST * cores())
+    _chosen = min(
+        threads if threads is not None else _get_default(),
+        MAX_THREADS_PER_CORE * count_cores(),
+    )
     for_torch = max(1, _chosen // 2) if rendering else _chosen
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(for_torch)
@@ -97,7 +100,7 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
 
 
 @contextmanager
-def given_back() -> Iterator[None]:
+def restore_threads() -> Iterator[None]:
     """Let torch and Dr.Jit have after the block the threads that they had before it,
     whatever is configured inside.
     """
@@ -112,7 +115,7 @@ def given_back() -> Iterator[None]:
     finally:
         _chosen = chosen
         if "torch" in sys.modules:
-            sys.modules["torch"].set_num_threads(for_torch or _default())
+            sys.modules["torch"].set_num_threads(for_torch or _get_default())
         if drjit is not None and drjit.thread_count() != for_drjit:
             drjit.set_thread_count(for_drjit)
         elif "drjit" in sys.modules and drjit is None:
@@ -136,14 +139,14 @@ def apply_to_drjit() -> None:
     after Mitsuba was imported.
     """
     drjit = sys.modules["drjit"]
-    wanted = _chosen if _chosen is not None else _default()
+    wanted = _chosen if _chosen is not None else _get_default()
     if drjit.thread_count() != wanted:
         drjit.set_thread_count(wanted)
 
 
-def _default() -> int:
+def _get_default() -> int:
     return (
         int(_USERS_COUNT)
         if _USERS_COUNT.isdecimal() and int(_USERS_COUNT) > 0
-        else cores()
+        else count_cores()
     )

@@ -241,7 +241,7 @@ def swept(
             load_job(config), run, watch or NullProgress(), SimulatedWorkers(pool)
         )
         sweep.execute()
-        assert run.store.count(KIND) == sweep.n_rows
+        assert run.store.count_rows(KIND) == sweep.n_rows
         return pool.now, sweep.stages.seconds["sweep"], pool
 
 

@@ -33,9 +33,9 @@ import yaml
 from scipy.stats import beta, binom, binomtest, norm
 
 from advsearch.cli.main import main as advsearch
-from advsearch.report.wording import interval_text, number_text, percent
+from advsearch.report.wording import format_interval, format_number, percent
 from advsearch.runs.store import Row, Store
-from advsearch.runs.tables import units_of
+from advsearch.runs.tables import read_units
 from advsearch.statistics.clustered import mean_interval, rate_interval
 from advsearch.statistics.sequential import ConfidenceSequence
 
@@ -221,8 +221,8 @@ class Counted:
         Pearson.
         """
         ends = exact(right, of) if interval is None else interval
-        self.shares.setdefault((right, of), []).append(interval_text(ends))
-        self.let(right, of, percent(right / of), interval_text(ends))
+        self.shares.setdefault((right, of), []).append(format_interval(ends))
+        self.let(right, of, percent(right / of), format_interval(ends))
 
     def let(self, *told: object) -> None:
         """Let these numbers stand there."""
@@ -244,12 +244,14 @@ def over_units(run: Path, rows: Sequence[Row]) -> Interval | None:
     own.
     """
     with Store(run / "results.sqlite", read_only=True) as store:
-        units = units_of(store)
+        units = read_units(store)
     if units is None:
         return None
     mine: dict[int, list[bool]] = {}
     for row, unit in zip(
-        rows, units.of(np.array([row.step for row in rows])).tolist(), strict=True
+        rows,
+        units.find_unit(np.array([row.step for row in rows])).tolist(),
+        strict=True,
     ):
         mine.setdefault(unit, []).append(bool(row.correct))
     if max(map(len, mine.values())) < 2:
@@ -335,7 +337,7 @@ def seen_from(found: Counted, counts: dict[str, tuple[int, int]]) -> None:
             binom.sf(right - 1, of, 0.5) < each
             or binom.sf(of - right - 1, of, 0.5) < each
         ):
-            found.let(number_text(float(value)))
+            found.let(format_number(float(value)))
     falling = np.array([counts[value][0] / counts[value][1] for value in at])
     weights = np.array([counts[value][1] for value in at], dtype=float)
     from sklearn.isotonic import IsotonicRegression
@@ -358,11 +360,13 @@ def drives(found: Counted, run: Path, rows: Sequence[Row]) -> None:
     from or to one.
     """
     with Store(run / "results.sqlite", read_only=True) as store:
-        units = units_of(store)
+        units = read_units(store)
     assert units is not None
     each: dict[int, list[tuple[float, float, str]]] = {}
     for row, unit in zip(
-        rows, units.of(np.array([one.step for one in rows])).tolist(), strict=True
+        rows,
+        units.find_unit(np.array([one.step for one in rows])).tolist(),
+        strict=True,
     ):
         time, away = (
             float(str(row.values[f"path.{name}"]["value"]))
@@ -420,7 +424,7 @@ def weigh(
     ]
     found.let(
         percent(mean),
-        interval_text((ends[0], ends[1])),
+        format_interval((ends[0], ends[1])),
         *(percent(part) for part, _ in shares),
     )
 
@@ -569,7 +573,7 @@ def gate(run: Path, told: dict[str, Any]) -> Counted:
         for row in rows:
             for value in values(row).values():
                 found.let(
-                    *(number_text(value), f"{value:.4g}")
+                    *(format_number(value), f"{value:.4g}")
                     if isinstance(value, float)
                     else ()
                 )

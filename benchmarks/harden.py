@@ -21,7 +21,7 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.progress import watched
+from advsearch.progress import open_progress
 from advsearch.questions.harden import harden
 from advsearch.questions.harden.result import (
     HardenConfig,
@@ -35,7 +35,7 @@ from advsearch.settings import parse_assignment
 SETTINGS: dict[str, object] = {
     "controls": "texture,pose,light",
     "epsilon": "texture=0.03",
-    "workers": threads.cores(),
+    "workers": threads.count_cores(),
 }
 MOST_LOST = 0.02
 
@@ -53,7 +53,7 @@ def main() -> int:
     else:
         first = {} if "controls" in changes else SETTINGS
         config = HardenConfig(**{**first, **changes, "run": str(args.run)})
-    with watched(True) as progress:
+    with open_progress(True) as progress:
         result = harden.run(
             config, progress=progress, resumed=args.run if there else None
         )

@@ -24,7 +24,7 @@ from typing import Any, get_args
 
 from pydantic.fields import ComputedFieldInfo, FieldInfo
 
-from advsearch.cli.flags import SCENE, help_text
+from advsearch.cli.flags import SCENE, format_help
 from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS
 from advsearch.controls import CONTROLS
@@ -220,7 +220,7 @@ def _wrapped(text: str) -> str:
 
 def _flag_row(one: Setting) -> list[str]:
     """A flag, what it is, its values and its default, cut from its help text."""
-    text = help_text(one).replace("%%", "%")
+    text = format_help(one).replace("%%", "%")
     if one.is_switch:
         return [f"`{one.flag}`", text, "no value", ""]
     values, marked, default = text.removeprefix(f"{one.description}: ").partition(

@@ -16,14 +16,14 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import format_result as text_of
 from advsearch.questions.attack.summary import (
     AttackSummary,
     PicturedPrediction,
     load_attack_summary,
 )
-from advsearch.report.wording import CLASSIFICATION, prediction_text
-from advsearch.runs.directory import default_name
+from advsearch.report.wording import CLASSIFICATION, format_prediction
+from advsearch.runs.directory import make_default_name
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURE = ROOT / "docs" / "images" / "attack-mug.png"
@@ -96,7 +96,7 @@ def _fitted(picture: Image.Image) -> Image.Image:
 
 def _said(prediction: PicturedPrediction | None) -> str:
     return (
-        prediction_text(CLASSIFICATION, prediction) if prediction else "no prediction"
+        format_prediction(CLASSIFICATION, prediction) if prediction else "no prediction"
     )
 
 
@@ -109,7 +109,7 @@ def with_adversarial(readme: str, summary: AttackSummary) -> str:
     """
     if readme.count(BEGIN) != 1 or readme.count(END) != 1:
         raise ValueError("README.md: expected one part made by docs/make_images.py")
-    place = f"runs/{default_name(summary.object, summary.controls)}-001"
+    place = f"runs/{make_default_name(summary.object, summary.controls)}-001"
     before, rest = readme.split(BEGIN)
     block = f"```text\n{text_of(summary.model_copy(update={'run': place}))}\n```\n"
     return f"{before}{BEGIN}{block}{END}{rest.split(END)[1]}"

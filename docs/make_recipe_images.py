@@ -100,7 +100,7 @@ def main() -> int:
         begun = (run / CONFIG).is_file()
         cpu = time.process_time()
         result = real(name, args.data, run) if args.data else bundled(name, run)
-        if result.goes_on:
+        if result.is_unfinished:
             print(name, "was interrupted, and is not kept", file=sys.stderr)
             return 1
         keep(
@@ -172,7 +172,11 @@ def real(name: str, data: Path, run: Path) -> RecipeResult:
 def done(run: Path) -> RecipeResult | None:
     """Return the result of a run that is done already."""
     result = read_result(run) if (run / NAME).is_file() else None
-    return result if isinstance(result, RecipeResult) and not result.goes_on else None
+    return (
+        result
+        if isinstance(result, RecipeResult) and not result.is_unfinished
+        else None
+    )
 
 
 def gone_on(run: Path) -> RecipeResult | None:
@@ -191,10 +195,10 @@ def renew(name: str, run: Path) -> None:
     if done(run):
         with Store(run / STORE) as store:
             kept = {
-                **(store.noted(RECIPE_NOTE) or {}),
+                **(store.read_json_note(RECIPE_NOTE) or {}),
                 "figures": read_recipe(name).figures,
             }
-            store.set_note(RECIPE_NOTE, json.dumps(kept))
+            store.write_note(RECIPE_NOTE, json.dumps(kept))
         gone_on(run)
 
 

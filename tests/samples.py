@@ -210,7 +210,9 @@ def make_run(path: Path, summary: AttackSummary = SUMMARY, *, pictures: bool = T
         if pictures:
             run.save_animation("search", [grey, grey * 0])
         for step in range(40) if rows else ():
-            run.record(Row("search", step, objective=step / 10 - 2), Row("baseline", step, objective=-2.0 - step / 100))
+            run.append_rows(
+                Row("search", step, objective=step / 10 - 2), Row("baseline", step, objective=-2.0 - step / 100)
+            )
         run.write_summary(summary)
     return path
 

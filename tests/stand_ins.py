@@ -133,7 +133,7 @@ def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume:
         stages = Stages(NullProgress())
         findings = attack_on(problem, config, make_policy(config.policy_name), stages, run)
         if not findings.interrupted:
-            run.store.forget()
+            run.store.delete_cached()
         return findings
 
 

@@ -63,7 +63,7 @@ def make_sweep(
             if keep == "all" or (keep == "wrong" and wrong):
                 picture = np.full((16, 16, 3), step / len(points), np.float32)
                 thumbnails.write_thumbnail(run.path, step, thumbnails.make_thumbnail(picture))
-        run.record(*rows)
+        run.append_rows(*rows)
         if ended:
             right = sum(bool(one.correct) for one in rows)
             counts = {

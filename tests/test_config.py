@@ -147,7 +147,7 @@ def of_command_line(line: str, config: type[Given] = AttackConfig) -> Given:  # 
     parser = argparse.ArgumentParser(allow_abbrev=False)
     flags.add_settings(parser, config=config)
     args = parser.parse_args(shlex.split(line)[2:])
-    return flags.config_from(args, config)
+    return flags.make_config(args, config)
 
 
 @pytest.mark.parametrize("flag", ["control", "over"])
@@ -190,7 +190,7 @@ def test_every_wrong_value_names_its_flag_and_what_was_expected(setting: Any) ->
     with pytest.raises(InputError) as error:
         AttackConfig(**data)
     assert str(error.value).startswith(f"{setting.name}: expected ") and message in str(error.value)
-    assert flags.with_flags(str(error.value)).startswith(f"{setting.flag}: expected ")
+    assert flags.format_as_flags(str(error.value)).startswith(f"{setting.flag}: expected ")
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_epsilon_is_a_number_greater_than_zero(value: Any) -> None:
 def test_all_problems_are_told_at_once() -> None:
     with pytest.raises(InputError) as error:
         AttackConfig.model_validate({"epsilon": -1, "steps": 0})
-    assert flags.with_flags(str(error.value)) == (
+    assert flags.format_as_flags(str(error.value)) == (
         f"--object: expected the name of an object or a {either(MESHES)} file, got nothing; "
         "--epsilon: expected a number greater than 0 and at most 1e+06, got -1; "
         "--steps: expected a whole number from 1 to 1000000, got 0"
@@ -339,7 +339,7 @@ def test_a_wrong_value_of_other_commands_names_its_flag(
 ) -> None:
     with pytest.raises(InputError) as error:
         config(**{"object": "mug", field: value})
-    assert flags.with_flags(str(error.value)) == f"--{field.replace('_', '-')}: {message}"
+    assert flags.format_as_flags(str(error.value)) == f"--{field.replace('_', '-')}: {message}"
 
 
 def own_settings(config: type[Config]) -> list[Setting]:
@@ -403,7 +403,7 @@ def test_no_value_of_any_setting_ends_in_a_traceback(config: type[Config]) -> No
 def test_slips_on_the_command_line_are_refused_in_one_sentence(line: str, message: str) -> None:
     with pytest.raises(InputError) as error:
         of_command_line(f"advsearch attack {'' if '--object' in line else '--object mug'} {line}")
-    assert flags.with_flags(str(error.value)).startswith(message)
+    assert flags.format_as_flags(str(error.value)).startswith(message)
 
 
 CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (

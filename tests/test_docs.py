@@ -29,7 +29,7 @@ from advsearch.attacks import (
     make_policy,
 )
 from advsearch.attacks.objectives import check_objective
-from advsearch.cli.flags import config_from
+from advsearch.cli.flags import make_config
 from advsearch.cli.main import _parse
 from advsearch.config import CONFIGS, RenderConfig, SceneConfig
 from advsearch.engine.acceptance import compare_views, compare_with_traced
@@ -186,7 +186,7 @@ def check_advsearch(words: list[str], folder: Path) -> None:
     if args.command in CONFIGS:
         brought = args.command in ("region", "sweep") and ("around" in args or "adversarial_of" in args)
         otherwise = {"object": "mug"} if brought else {}
-        check_names(config_from(args, CONFIGS[args.command], **otherwise))
+        check_names(make_config(args, CONFIGS[args.command], **otherwise))
     if args.command in ("run", "resume"):
         run = Path(args.run).name if args.command == "resume" else ""
         of_a_recipe = run.rpartition("-")[0] in recipes()

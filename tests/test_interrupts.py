@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import torch
 
-from advsearch.cli.output import LookingProgress
-from advsearch.interrupts import INTERRUPTS, ONE, Interrupts, interruptible, unless_interrupted
+from advsearch.cli.output import InterruptCheckingProgress
+from advsearch.interrupts import DUPLICATE_SECONDS, INTERRUPTS, Interrupts, interruptible, unless_interrupted
 from advsearch.progress import NullProgress
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from conftest import ROOT
@@ -119,11 +119,11 @@ def workers_results() -> Any:
 
 
 def progress_advances() -> None:
-    LookingProgress(NullProgress()).advance()
+    InterruptCheckingProgress(NullProgress()).advance()
 
 
 def progress_stages() -> None:
-    LookingProgress(NullProgress()).stage("next")
+    InterruptCheckingProgress(NullProgress()).stage("next")
 
 
 @pytest.mark.medium
@@ -165,7 +165,7 @@ def test_a_second_one_ends_native_code_at_once_and_one_that_is_passed_on_does_no
 
 
 def test_one_that_is_passed_on_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    times = iter([5.0, 5.0 + ONE / 2, 6.0 + ONE])
+    times = iter([5.0, 5.0 + DUPLICATE_SECONDS / 2, 6.0 + DUPLICATE_SECONDS])
     monkeypatch.setattr("advsearch.interrupts.time.monotonic", lambda: next(times))
     handler = Interrupts()
     with pytest.raises(KeyboardInterrupt):

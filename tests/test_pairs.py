@@ -23,7 +23,7 @@ from advsearch.engine.problem import Problem
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.axes import Points, add_grid_axes, parse_axes
-from advsearch.runs.results import plain
+from advsearch.runs.results import to_json_value
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.description import load_description
 from advsearch.tasks import Classification
@@ -144,7 +144,7 @@ def test_a_row_of_a_sweep_is_true_of_its_own_picture(pair: tuple[str, ...], mode
     axes = parse_axes(grid, drawn)
     rows = {row.step: row for row in found.rows()}
     worst = found.summary.worst
-    assert worst is not None and plain(worst.values) == rows[worst.configuration].values
+    assert worst is not None and to_json_value(worst.values) == rows[worst.configuration].values
     for row in rows.values():
         assert row.seed is not None
         space = make_space(add_grid_axes(drawn, axes, description), description)

@@ -12,9 +12,9 @@ import pytest
 import torch
 
 from advsearch.attacks import Evaluation, Query, make_policy
-from advsearch.attacks.trials import choose_spp, most_samples
-from advsearch.cli.flags import with_flags
-from advsearch.cli.output import shown_text as check_text
+from advsearch.attacks.trials import choose_spp, count_max_samples
+from advsearch.cli.flags import format_as_flags
+from advsearch.cli.output import format_result as check_text
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import RunState
 from advsearch.experiment import run_experiment as answered
@@ -159,7 +159,7 @@ def test_samples_of_the_ladder_have_a_bound() -> None:
         return [float(torch.randn((), generator=torch.Generator().manual_seed(seed % 2**63))) for seed in seeds]
 
     count = choose_spp({"adversarial": never_settles, "clean": never_settles}, seed=0)
-    assert not count.converged and spent <= most_samples(2) == 2 * 8 * 340
+    assert not count.converged and spent <= count_max_samples(2) == 2 * 8 * 340
 
 
 @pytest.mark.parametrize("most", [boxes.MAX_PROBED, 60])
@@ -200,7 +200,7 @@ def test_every_command_says_what_it_does_and_how_far_it_is(tmp_path: Path, confi
     progress = Recorded()
     answered(config.model_copy(update={"run": str(tmp_path / "run")}), progress=progress)
     progress.check()
-    hints = [with_flags(one.hint) for one in progress.stages]
+    hints = [format_as_flags(one.hint) for one in progress.stages]
     assert any("--" in one for one in hints) and not any("`" in one for one in hints)
 
 
@@ -267,5 +267,5 @@ def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_st
     assert rendered + 4 == whole.summary.renders["verification"] == resumed.summary.renders["verification"]
     assert resumed.summary.worst == whole.summary.worst
     with RunDirectory.resume(tmp_path / "run") as run, RunDirectory.resume(tmp_path / "whole") as other:
-        counts = run.store.counts()
-        assert counts == other.store.counts() and counts["sample count worst"] + 14 == rendered + 4
+        counts = run.store.count_by_kind()
+        assert counts == other.store.count_by_kind() and counts["sample count worst"] + 14 == rendered + 4

@@ -29,13 +29,13 @@ def in_new_process(**variables: str) -> list[object]:
 
 
 def test_every_core_and_openmp_set_without_importing_torch() -> None:
-    assert in_new_process() == [threads.cores(), threads.OPENMP_DEFAULTS]
+    assert in_new_process() == [threads.count_cores(), threads.OPENMP_DEFAULTS]
 
 
 def test_what_the_user_has_set_is_left_alone() -> None:
     kept = {"OMP_WAIT_POLICY": "ACTIVE", "KMP_BLOCKTIME": threads.OPENMP_DEFAULTS["KMP_BLOCKTIME"]}
     assert in_new_process(OMP_WAIT_POLICY="ACTIVE", OMP_NUM_THREADS="1") == [1, kept]
-    assert in_new_process(GOMP_SPINCOUNT="7") == [threads.cores(), dict.fromkeys(threads.OPENMP_DEFAULTS)]
+    assert in_new_process(GOMP_SPINCOUNT="7") == [threads.count_cores(), dict.fromkeys(threads.OPENMP_DEFAULTS)]
 
 
 @pytest.mark.parametrize(("count", "rendering", "expected"), [(1, True, 1), (4, True, 2), (4, False, 4)])
@@ -55,12 +55,12 @@ def test_a_torch_that_is_loaded_gets_its_share(count: int, rendering: bool, expe
 def test_a_containers_quota_bounds_the_cores(tmp_path: Path, text: str, expected: int | None) -> None:
     quota = tmp_path / "cpu.max"
     quota.write_text(text)
-    assert threads.cores(quota) == (expected or threads.cores(tmp_path / "absent"))
+    assert threads.count_cores(quota) == (expected or threads.count_cores(tmp_path / "absent"))
 
 
 def test_a_file_that_asks_for_very_many_threads_gets_a_few_for_each_core() -> None:
     try:
-        assert threads.configure(1024) == threads.MOST * threads.cores()
+        assert threads.configure(1024) == threads.MAX_THREADS_PER_CORE * threads.count_cores()
     finally:
         threads.configure()
 

@@ -308,9 +308,9 @@ def results() -> Iterator[str]:
     said = {name for row in rows for name in re.findall(r"`([a-z_]+)`", row)}
     yield from (
         f"docs/runs.md: expected a row of {name}"
-        for name in {*export.OWN, *export.AFTER} - said
+        for name in {*export.LEADING_COLUMNS, *export.TRAILING_COLUMNS} - said
     )
-    if {*export.OWN, *export.AFTER, "values", "metrics"} != {
+    if {*export.LEADING_COLUMNS, *export.TRAILING_COLUMNS, "values", "metrics"} != {
         one.name for one in fields(store.Row)
     }:
         yield "advsearch/runs/export.py: expected every field of a row"
@@ -432,7 +432,7 @@ MADE_BY_HAND = [
         "questions.md",
         f"until they are within {100 * (candidates.RATIO - 1):.0f} % of each other",
     ),
-    ("questions.md", {12: "or twelve searches are done"}[candidates.ROUNDS]),
+    ("questions.md", {12: "or twelve searches are done"}[candidates.MAX_SEARCHES]),
     (
         "questions.md",
         f"Each step needs {MIN_TRIALS} trials without a failure, or {TRIALS} trials "

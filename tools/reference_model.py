@@ -94,7 +94,7 @@ def render(split: str, count: int, cache: Path, seed: int) -> None:
     ]
     missing = [job for job in jobs if not _complete(Path(job[-1]), job[2] - job[1])]
     context = multiprocessing.get_context("spawn")
-    with context.Pool(threads.cores(), maxtasksperchild=1) as pool:
+    with context.Pool(threads.count_cores(), maxtasksperchild=1) as pool:
         for done, _ in enumerate(
             pool.imap_unordered(_render_block, missing, chunksize=1), start=1
         ):

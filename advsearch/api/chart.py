@@ -24,8 +24,8 @@ from torch import Tensor
 
 from advsearch.calls import with_checked_arguments
 from advsearch.errors import InputError
-from advsearch.pictures import upright
-from advsearch.report.sheets import MARGIN, blank
+from advsearch.pictures import load_upright
+from advsearch.report.sheets import MARGIN, make_blank_page
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 
 Floats = npt.NDArray[np.float64]
@@ -68,7 +68,7 @@ def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Fig
         paper: (width, height) of the page in millimetres.
         convert: a color transform of PIL; None for none.
     """
-    figure, axes = blank(paper)
+    figure, axes = make_blank_page(paper)
     left = (paper[0] - CHART_SIZE[0]) / 2.0
     top = MARGIN + 2.0 * CORNER_SIZE
 
@@ -115,7 +115,9 @@ def measured_palette(photograph: str | Path) -> Tensor:
         FileFormatError: the file is no image, or too large.
         InputError: it shows no such chart.
     """
-    light = srgb_to_linear(upright(Path(photograph), MAX_IMAGE_SIZE)).astype(np.float64)
+    light = srgb_to_linear(load_upright(Path(photograph), MAX_IMAGE_SIZE)).astype(
+        np.float64
+    )
     homography = _compute_homography(CORNER_CENTERS, _find_corners(light, photograph))
     patch_offsets = _make_pairs(np.linspace(-0.25, 0.25, 7) * PATCH_SIZE)
     paper_offsets = _make_pairs(np.linspace(-0.3, 0.3, 3) * (PITCH - PATCH_SIZE))

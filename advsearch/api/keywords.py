@@ -36,7 +36,7 @@ from advsearch.engine.naming import (
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import describe_value
-from advsearch.progress import watched
+from advsearch.progress import open_progress
 from advsearch.settings import Config, PythonOnly, settings, to_python
 from advsearch.trust.code import allow_named
 from advsearch.trust.stored_files import is_shallow
@@ -172,7 +172,7 @@ def with_settings_signature(config: type[Config]) -> Callable[[Function], Functi
             with ExitStack() as stack:
                 stack.enter_context(hold_process_lock())
                 if "progress" in own_signature.parameters:
-                    progress = watched(plain_keywords.get("progress"))
+                    progress = open_progress(plain_keywords.get("progress"))
                     plain_keywords["progress"] = stack.enter_context(progress)
                 for key in ("task", "objective", "policy"):
                     if key in plain_keywords and key not in own_signature.parameters:

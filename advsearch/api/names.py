@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.catalog import list_built_ins
-from advsearch.errors import InputError, UnknownNameError, resembling
+from advsearch.errors import InputError, UnknownNameError, find_similar_names
 from advsearch.runs.directory import find_run
 from advsearch.scene.library import (
     MAP_HINT,
@@ -58,7 +58,7 @@ def check_names(config: Config) -> None:
     like_reference = [
         name
         for name in split_names(values.get("model") or "")
-        if resembling(name, ["reference"])
+        if find_similar_names(name, ["reference"])
     ]
     _check_words(
         "model",
@@ -152,7 +152,7 @@ def _check_controls(values: Mapping[str, Any]) -> None:
     like_controls = [
         name
         for name in names
-        if name not in PARAMETERS and resembling(name, built_in_controls)
+        if name not in PARAMETERS and find_similar_names(name, built_in_controls)
     ]
     _check_words("control", like_controls, "controls")
 
@@ -166,7 +166,7 @@ def _check_suite(suite: str) -> None:
         for folder in {Path(suite).parent, Path("suites")}
         for file in sorted(folder.glob("*.y*ml"))
     ]
-    similar = resembling(Path(suite).stem, [file.stem for file in files])[:1]
+    similar = find_similar_names(Path(suite).stem, [file.stem for file in files])[:1]
     matches = [file for file in files if file.stem in similar]
     hint = f"; did you mean {matches[0]}?" if matches else ""
     raise InputError(f"suite: there is no file {suite}{hint}")

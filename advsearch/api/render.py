@@ -32,7 +32,7 @@ from advsearch.engine.rendering import Rendering as Rendering
 from advsearch.engine.rendering import check_image_path
 from advsearch.errors import InputError
 from advsearch.models import Model
-from advsearch.progress import NullProgress, Progress, shows_progress
+from advsearch.progress import NullProgress, Progress, with_progress_option
 from advsearch.questions.attack.carry_out import load_parts_of_run
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.summary import AttackSummary
@@ -45,7 +45,7 @@ from advsearch.runs.summary import read_configuration, read_result
 from advsearch.scene.formation import parse_aovs
 from advsearch.scene.importing.hdr import read_exr
 from advsearch.tasks import AnyTask, make_task
-from advsearch.trust.code import allow_named, names_code
+from advsearch.trust.code import allow_code_of_call, allow_named
 from advsearch.trust.stored_files import LARGEST_FILE, read_bytes
 
 if TYPE_CHECKING:
@@ -133,8 +133,8 @@ def load_model(
 load_model.__doc__ = models.load_model.__doc__
 load_model.__signature__ = inspect.signature(models.load_model)  # type: ignore[attr-defined]
 load_model = with_checked_arguments(load_model)
-render = names_code(
-    with_checked_arguments(hold_process_lock()(shows_progress(rendering.render)))
+render = allow_code_of_call(
+    with_checked_arguments(hold_process_lock()(with_progress_option(rendering.render)))
 )
 
 

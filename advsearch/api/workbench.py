@@ -67,10 +67,10 @@ from advsearch.engine.verifier import (
 from advsearch.options import FROM_RUN as FROM_RUN
 from advsearch.options import Value as Value
 from advsearch.options import count_outcomes as count_outcomes
-from advsearch.pictures import upright as upright
+from advsearch.pictures import load_upright as load_upright
 from advsearch.progress import NullProgress as NullProgress
-from advsearch.progress import Watched as Watched
-from advsearch.progress import watcher as watcher
+from advsearch.progress import ProgressOption as ProgressOption
+from advsearch.progress import as_progress as as_progress
 from advsearch.questions.attack.carry_out import LOADING as LOADING
 from advsearch.questions.attack.carry_out import ROLES_IN_SEARCH as ROLES_IN_SEARCH
 from advsearch.questions.attack.carry_out import AttackParts as AttackParts
@@ -113,6 +113,7 @@ from advsearch.runs.summary import read_configuration as read_configuration
 from advsearch.runs.tables import units_of as units_of
 from advsearch.runs.twins import find_twin_evidence as find_twin_evidence
 from advsearch.runs.twins import read_twins as read_twins
+from advsearch.runs.tables import read_units as read_units
 from advsearch.scene import library as library
 from advsearch.scene.assembly import pose_mesh as pose_mesh
 from advsearch.scene.camera_files import read_camera as read_camera
@@ -128,11 +129,12 @@ from advsearch.tasks import make_task as make_task
 from advsearch.tasks.base import Truth as Truth
 from advsearch.tasks.together import EnsembleTask as EnsembleTask
 from advsearch.threads import all_for_torch as all_for_torch
-from advsearch.threads import cores as cores
+from advsearch.threads import count_cores as count_cores
 from advsearch.trust.code import allow_named as allow_named
 from advsearch.trust.programs import find_blender as find_blender
 from advsearch.trust.programs import surroundings as surroundings
 from advsearch.trust.yaml_text import parse_yaml as parse_yaml
+from advsearch.trust.programs import make_environment as make_environment
 
 
 def load_photographs() -> Any:

@@ -310,16 +310,18 @@ def select_diverse(
 RATIO = 1.05  # the bracket is closed once high / low is at most this
 SMALLEST_SCALE = 1e-3  # no smaller scale than this is tried
 
-ROUNDS = 12
+MAX_SEARCHES = 12
 
-ATTEMPTS = 6  # steps outwards that the confirmation of the upper end takes at most
+MAX_CONFIRMATIONS = (
+    6  # steps outwards that the confirmation of the upper end takes at most
+)
 
 LENGTH_RATIO = 1.0 + (RATIO - 1.0) / 5.0
 """A configuration's length is bisected until the ends are within this: a fifth of the
 bracket's ratio.
 """
 
-MOST_CHECKS = 1 + math.ceil(
+MAX_CHECKS = 1 + math.ceil(
     math.log2(math.log(1.0 / SMALLEST_SCALE) / math.log(LENGTH_RATIO))
 )
 """Configurations that go through the trials after a search, at most: what it found, and
@@ -398,7 +400,7 @@ def find_smallest_change(
        its length, to the shortest that passes: a handful of trials, no search.
     3. A search at half the scale reached, then at the geometric mean of the bracket's
        ends; each configuration that passes is shortened as in 2, each that fails raises
-       the lower end; until it is closed, or after `ROUNDS`.
+       the lower end; until it is closed, or after `MAX_SEARCHES`.
 
     For a linear model and a gradient policy the first search points the right way and 2
     ends within its own step of the optimum, so that the result is within `RATIO` of the
@@ -414,7 +416,7 @@ def find_smallest_change(
         return replace(state, low=1.0)
     state = _shorten(state, u, 1.0, passes, domain, likely)
     while (
-        state.searches < ROUNDS
+        state.searches < MAX_SEARCHES
         and state.high > RATIO * state.low
         and state.high > SMALLEST_SCALE
     ):
@@ -442,14 +444,14 @@ def confirm_bracket(
     """Return the bracket with its upper end moved out until the configuration there
     passes so many times in a row: what lies exactly on the edge passes its trials by
     chance. So it is tried again with new seeds; where it fails, the change grows by a
-    fortieth, in `ATTEMPTS`, the last of which is returned untried.
+    fortieth, in `MAX_CONFIRMATIONS`, the last of which is returned untried.
     """
     if bracket.u is None:
         return bracket
     shortest_u = bracket.u
     shortest_scale = bracket.high
     growth = 1.0
-    for _ in range(ATTEMPTS):
+    for _ in range(MAX_CONFIRMATIONS):
         if all(passes(bracket.u, bracket.checks + repeat) for repeat in range(times)):
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
         growth *= math.sqrt(RATIO)

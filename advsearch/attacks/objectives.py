@@ -34,7 +34,7 @@ from advsearch.attacks.objective_functions import ReadFeatures
 
 # for objectives of plugins, docs/extending.md
 from advsearch.attacks.objective_functions import margin as margin
-from advsearch.copies import copied
+from advsearch.copies import copy_value
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import describe_value
 from advsearch.registry import Registry, load_attribute
@@ -173,8 +173,8 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         count = images.shape[0]
         labels = truth_to_labels(truth, output, count)
         arguments = (output, images, labels) if signature.images else (output, labels)
-        argument_copies = copied(arguments)
-        input_copies = copied(inputs)
+        argument_copies = copy_value(arguments)
+        input_copies = copy_value(inputs)
         try:
             result = function(*argument_copies, **input_copies)
         except TypeError as error:
@@ -399,7 +399,7 @@ def _pass_copies(objective: Objective) -> Objective:
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
         return objective(
-            *copied((output, images, truth)), lambda name: copied(more(name))
+            *copy_value((output, images, truth)), lambda name: copy_value(more(name))
         )
 
     return handed

@@ -35,7 +35,7 @@ from advsearch.attacks.evaluation import (
 )
 from advsearch.attacks.policies.choices import wrap_choices
 from advsearch.attacks.verification import Ending
-from advsearch.copies import copied
+from advsearch.copies import copy_value
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.seeds import stream
@@ -352,7 +352,7 @@ class _Log:
                     )
                 self.before = gradient
             if self.on_step is not None:
-                self.on_step(self.records[-1], *copied((proposal.u, evaluation)))
+                self.on_step(self.records[-1], *copy_value((proposal.u, evaluation)))
             yield evaluation
             started = time.perf_counter()
 

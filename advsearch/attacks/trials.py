@@ -338,7 +338,7 @@ def list_look_sizes(trials: int = 0) -> tuple[int, ...]:
     )
 
 
-def most_samples(
+def count_max_samples(
     configurations: int, ladder: Sequence[int] = LADDER, trials: int = 0
 ) -> int:
     """Return the samples a pixel that `choose_spp` renders in all, at most: where only

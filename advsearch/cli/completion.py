@@ -81,7 +81,7 @@ def completion(args: argparse.Namespace) -> int:
                 }
             action.complete = completer  # type: ignore[attr-defined]  # where shtab looks for it
     script = shtab.complete(parser, shell=args.shell)
-    return output.say(
+    return output.print_answer(
         args.json,
         {"command": "completion", "shell": args.shell, "script": script},
         script,

@@ -22,7 +22,7 @@ from advsearch.viewer.server import Dashboard
 PORT = 8265
 PHOTOGRAPH_PAGES = "advsearch.questions.photographs.pages:PhotographPages"
 
-SEEN = (
+PRIVACY_NOTE = (
     "Whoever has this address sees the runs and can send photographs. Each is judged "
     "on this machine, by the model "
     "that the run's settings name, and kept in the run's folder, as a picture and as "
@@ -80,7 +80,7 @@ def dashboard(args: argparse.Namespace) -> int:
         "token": server.token,
         "fingerprint": server.fingerprint,
     }
-    output.say(args.json, {"command": "dashboard", **facts}, server.address)
+    output.print_answer(args.json, {"command": "dashboard", **facts}, server.address)
     sys.stdout.flush()
     if server.fingerprint:
         print(
@@ -90,7 +90,7 @@ def dashboard(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     if server.token:
-        print(SEEN, file=sys.stderr)
+        print(PRIVACY_NOTE, file=sys.stderr)
         print(
             format_qr_code(server.address)
             or f"For a code to point a phone at: {NO_QR}",
@@ -134,7 +134,7 @@ def view(args: argparse.Namespace) -> int:
         if args.bundle is None
         else write_bundle(folders, Path(args.bundle))
     )
-    return output.say(
+    return output.print_answer(
         args.json,
         {"command": "view", "runs": list(map(str, folders)), "out": str(out)},
         str(out),

@@ -29,7 +29,7 @@ from advsearch.cli import output
 from advsearch.cli.main import command
 from advsearch.errors import FELL_SHORT, AdvsearchError
 from advsearch.scene.mitsuba_backend import llvm
-from advsearch.trust.code import OWN_FOLDER
+from advsearch.trust.code import SUBPROCESS_DIRECTORY
 from advsearch.version import __version__
 
 OK = "ok"
@@ -119,13 +119,13 @@ def diagnose() -> list[Component]:
     return [
         Component("Python", platform.python_version(), OK, sys.executable),
         Component("advsearch", __version__, OK, str(resources.files("advsearch"))),
-        *packages(run_probe()),
-        other_packages(),
+        *check_packages(run_probe()),
+        check_other_packages(),
         check_llvm(),
-        bundled_scenes(),
-        reference_weights(),
-        kernel_cache(Path.home() / ".drjit"),
-        disk(Path.cwd()),
+        check_bundled_scenes(),
+        check_reference_weights(),
+        check_kernel_cache(Path.home() / ".drjit"),
+        check_disk(Path.cwd()),
         check_hardware(),
     ]
 
@@ -142,7 +142,7 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
             text=True,
             timeout=SECONDS_ALLOWED,
             check=False,
-            cwd=OWN_FOLDER,
+            cwd=SUBPROCESS_DIRECTORY,
         )
         printed = done.stdout
         status = done.returncode
@@ -182,7 +182,7 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
     return {**tried, "": (good, ending)}
 
 
-def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
+def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
     """The packages that were tried, with their versions; a render stands for Mitsuba
     and Dr.Jit together.
     """
@@ -195,7 +195,7 @@ def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
         "mitsuba-oidn",
         *_SMALL_PACKAGES,
     ):
-        version = "" if name == "render" else installed_version(name)
+        version = "" if name == "render" else find_installed_version(name)
         if version is None:
             status, why = (
                 (WARNING, f": {OPTIONAL[name]}") if name in OPTIONAL else (MISSING, "")
@@ -225,7 +225,7 @@ def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
             )
 
 
-def other_packages(requirements: Sequence[str] | None = None) -> Component:
+def check_other_packages(requirements: Sequence[str] | None = None) -> Component:
     """The dependencies that need no trial: present or not. Requirements are as in the
     package's metadata, e.g. ``"rich>=13"``; None reads them there.
     """
@@ -241,7 +241,7 @@ def other_packages(requirements: Sequence[str] | None = None) -> Component:
         names - {"numpy", "torch", "mitsuba", "mitsuba-oidn", *_SMALL_PACKAGES},
         key=str.lower,
     )
-    versions = {name: installed_version(name) for name in rest}
+    versions = {name: find_installed_version(name) for name in rest}
     if absent := [name for name, version in versions.items() if version is None]:
         why = f"not installed: {', '.join(absent)}"
         return Component(
@@ -255,7 +255,7 @@ def other_packages(requirements: Sequence[str] | None = None) -> Component:
     )
 
 
-def installed_version(name: str) -> str | None:
+def find_installed_version(name: str) -> str | None:
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -303,7 +303,7 @@ def check_llvm() -> Component:
     return Component("libLLVM", ".".join(map(str, chosen.version)), OK, detail)
 
 
-def bundled_scenes() -> Component:
+def check_bundled_scenes() -> Component:
     """The objects and environments that travel inside the package."""
     name = "bundled scenes"
     fix = "reinstall advsearch; in a checkout: git restore advsearch/bundled/data"
@@ -323,7 +323,7 @@ def bundled_scenes() -> Component:
     )
 
 
-def reference_weights() -> Component:
+def check_reference_weights() -> Component:
     """The weights and labels of the bundled classifier."""
     folder = resources.files("advsearch.models") / "data"
     absent = [
@@ -344,7 +344,7 @@ def reference_weights() -> Component:
     return Component("reference model", "", OK, f"{size / 1e6:.1f} MB of weights")
 
 
-def kernel_cache(folder: Path) -> Component:
+def check_kernel_cache(folder: Path) -> Component:
     """The folder in which Dr.Jit keeps compiled kernels between runs."""
     name = "kernel cache"
     try:
@@ -363,7 +363,7 @@ def kernel_cache(folder: Path) -> Component:
     )
 
 
-def disk(folder: Path) -> Component:
+def check_disk(folder: Path) -> Component:
     """The space left where runs are written by default."""
     free = shutil.disk_usage(folder).free
     if free < DISK_WANTED:
@@ -375,7 +375,7 @@ def disk(folder: Path) -> Component:
 
 
 def check_hardware() -> Component:
-    cores = threads.cores()
+    cores = threads.count_cores()
     memory = 0  # where the system does not tell
     with suppress(AttributeError, ValueError, OSError):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -22,7 +22,7 @@ PIXELS = 8
 NOISE = 0.08
 
 
-def imported(name: str) -> str:
+def probe_import(name: str) -> str:
     importlib.import_module(name)
     return "imported"
 
@@ -115,7 +115,7 @@ PACKAGES = (
 )
 
 TRIALS: dict[str, Callable[[], str]] = {
-    **{name: partial(imported, MODULES.get(name, name)) for name in PACKAGES},
+    **{name: partial(probe_import, MODULES.get(name, name)) for name in PACKAGES},
     "render": probe_renderer,
     "mitsuba-oidn": probe_denoiser,
 }

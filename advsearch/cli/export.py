@@ -100,17 +100,17 @@ def export(args: argparse.Namespace) -> int:
                 f"--{option}: belongs to --format {' and '.join(owners)}; leave it out"
             )
     if format in FORMATS or format not in EXPORTERS:
-        return _table(args, out, by_name)
+        return _write_table(args, out, by_name)
     exporter = EXPORTERS[format]()
     if out is None:
         raise InputError(f"--out: {format} writes {exporter.writes}; give its name")
     if args.kind is not None and "kind" not in exporter.options:
         raise InputError("--kind: is only for tables of rows; leave it out")
     options = {option: getattr(args, option, None) for option in exporter.options}
-    with output.at_work(as_json=True, quiet=False) as progress:
+    with output.open_command_progress(as_json=True, quiet=False) as progress:
         exported = exporter.write(args.run, out, options, progress)
     facts = {"command": "export", "format": format, **exported.facts, "out": str(out)}
-    return output.say(args.json, facts, exported.text, sys.stderr)
+    return output.print_answer(args.json, facts, exported.text, sys.stderr)
 
 
 def _choose_format(
@@ -137,7 +137,7 @@ def _choose_format(
     return format
 
 
-def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
+def _write_table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
     """Write the rows of a run as a table to a file, or print them."""
     format = args.format or _choose_table_format(args, out, by_name)
     if args.json and out is None and format != "json":
@@ -165,7 +165,7 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
         return 0
     text = f"{count} rows in {out}" + ("" if by_name == format else f", as {format}")
     facts = {"command": "export", "rows": count, "format": format, "out": str(out)}
-    return output.say(args.json, facts, text, sys.stderr)
+    return output.print_answer(args.json, facts, text, sys.stderr)
 
 
 def _choose_table_format(

@@ -64,10 +64,10 @@ def add_settings(
         }
         if setting.is_switch:
             options = {"action": "store_const", "const": not setting.default}
-        add(setting.flag, dest=setting.field, help=help_text(setting), **options)
+        add(setting.flag, dest=setting.field, help=format_help(setting), **options)
 
 
-def config_from(
+def make_config(
     args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any
 ) -> AnyConfig:
     """Return the configuration of a kind that the flags describe, with values for
@@ -82,7 +82,7 @@ def config_from(
     if "scene" in args and data.get("object") is None:
         raise InputError(
             f"object: expected something in {args.scene}, got nothing; "
-            f"name one of {_inside(args.scene)}"
+            f"name one of {_format_inside(args.scene)}"
         )
     if "scene" in args and isinstance(data.get("object"), str):
         data["object"] = ",".join(
@@ -93,14 +93,14 @@ def config_from(
     return read
 
 
-def command_in(file: str | Path) -> str:
+def read_command(file: str | Path) -> str:
     """Return the command that a file is for. Raises FileFormatError where it is not a
     file with settings.
     """
     return str(read_yaml(file).get("command", "attack"))
 
 
-def config_of_file(
+def read_file_config(
     command: str, file: str | Path, changes: Mapping[str, object]
 ) -> Config:
     """Return the configuration that a file describes, `changes` put over it. Raises
@@ -111,7 +111,7 @@ def config_of_file(
     return CONFIGS[command].from_yaml(file, changes)
 
 
-def _inside(scene: str) -> str:
+def _format_inside(scene: str) -> str:
     # late: another thing has this name here
     from advsearch.scene.importing.files import format_name
 
@@ -136,7 +136,7 @@ def _inside(scene: str) -> str:
     )
 
 
-def with_flags(message: str) -> str:
+def format_as_flags(message: str) -> str:
     """Return an error's message with the flags of the settings that it names.
 
     Messages name a setting as Python and YAML do: before a colon at their beginning, or
@@ -165,7 +165,7 @@ def with_flags(message: str) -> str:
     )
 
 
-def help_text(setting: Setting) -> str:
+def format_help(setting: Setting) -> str:
     """Return what the help says of a setting; of a switch, what its flag does."""
     text = (
         setting.switched or setting.description if setting.is_switch else setting.text

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import advsearch
 from advsearch.cli import output
 from advsearch.cli.main import argument, command
-from advsearch.cli.output import at_work
+from advsearch.cli.output import open_command_progress
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 from advsearch.runs.summary import read_result
@@ -50,24 +50,24 @@ def file(args: argparse.Namespace) -> int:
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
-    with at_work(as_json=True, quiet=False):
+    with open_command_progress(as_json=True, quiet=False):
         # late: another thing has this name here
         from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, contents
 
         if Path(args.file).suffix.lower() == MITSUBA_SUFFIX:
-            facts, lines = _mitsuba_file(args.file, out)
+            facts, lines = _describe_mitsuba_file(args.file, out)
         else:
             inside = contents(Path(args.file))
-            facts, lines = _mesh_file(args.file, inside)
+            facts, lines = _describe_mesh_file(args.file, inside)
             if out is not None:
                 advsearch.render(
                     advsearch.load_scene(inside.object), around=VIEWS, resolution=SIDE
                 ).save(out)
     facts = {"command": "import", "file": args.file, **facts, "out": args.out}
-    return output.say(args.json, facts, "\n".join(lines))
+    return output.print_answer(args.json, facts, "\n".join(lines))
 
 
-def _mesh_file(file: str, inside: Contents) -> Understood:
+def _describe_mesh_file(file: str, inside: Contents) -> Understood:
     """Return what the file of a mesh contains, as facts for JSON and as lines of
     text.
     """
@@ -178,7 +178,7 @@ def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
         size = " x ".join(f"{length:.3g}" for length in node.size)
         rows.append([node.name, node.mesh_name, f"{node.triangles:,} triangles", size])
     lines = [
-        output.aligned(rows),
+        output.align_columns(rows),
         "One of them as the object, the rest around it: --object "
         f"'{file}#{nodes[-1].name}'",
     ]
@@ -189,7 +189,7 @@ def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
     return lines
 
 
-def _mitsuba_file(file: str, out: Path | None) -> Understood:
+def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
     # late: another thing has this name here
     from advsearch.scene.mitsuba_backend.scene_files import read_contents
 

@@ -25,11 +25,11 @@ from advsearch.cli.output import (
     BAD_INPUT,
     INTERRUPTED,
     OK,
-    at_work,
     end_output,
+    escape_output,
+    open_command_progress,
     open_descriptors,
-    screens,
-    shortened,
+    shorten_words,
 )
 from advsearch.errors import (
     AdvsearchError,
@@ -44,7 +44,7 @@ from advsearch.registry import (
     get_experiment_help,
     load_attribute,
 )
-from advsearch.trust.code import allow_code, nothing_allowed
+from advsearch.trust.code import allow_code, restrict_allowed_code
 from advsearch.version import __version__
 
 if TYPE_CHECKING:
@@ -136,8 +136,10 @@ class ExperimentCommand:
         if self.experiment.choices and subject == "list":
             lines = load_attribute(self.experiment.choices)()
             listed = [{"name": name, "title": text} for name, text in lines.items()]
-            return output.say(
-                args.json, {f"{self.name}s": listed}, output.aligned([*lines.items()])
+            return output.print_answer(
+                args.json,
+                {f"{self.name}s": listed},
+                output.align_columns([*lines.items()]),
             )
         if self.experiment.positional and subject in (None, []):
             command = f"advsearch {self.name}"
@@ -156,7 +158,7 @@ class ExperimentCommand:
         that it is about.
         """
         # late, so that --help answers at once
-        from advsearch.cli.flags import config_from
+        from advsearch.cli.flags import make_config
         from advsearch.runs.directory import CONFIG, find_run
         from advsearch.settings import settings, split_names
 
@@ -164,12 +166,12 @@ class ExperimentCommand:
         about = self.experiment.about
         read_defaults = self.experiment.defaults_from_run
         if read_defaults is None:
-            return config_from(args, config_type)
+            return make_config(args, config_type)
         if about in args:
             run_name = getattr(args, about)
             if self.experiment.positional and self.experiment.positional.is_repeatable:
                 run_name = next(iter(split_names(run_name)), run_name)
-            return config_from(
+            return make_config(
                 args,
                 config_type,
                 **read_defaults(find_run(run_name) / CONFIG, vars(args)),
@@ -186,7 +188,7 @@ class ExperimentCommand:
                 f"{command}: expected {missing[0]} NAME, or {run_flag}; "
                 f"see {command} --help"
             )
-        return config_from(args, config_type)
+        return make_config(args, config_type)
 
     def run_config(
         self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None
@@ -194,15 +196,15 @@ class ExperimentCommand:
         """Run the experiment with settings, or continue a run; print the result and
         return the exit status.
         """
-        with at_work(as_json=as_json, quiet=quiet) as progress:
+        with open_command_progress(as_json=as_json, quiet=quiet) as progress:
             from advsearch import experiment  # late, so that --help answers at once
 
             result = experiment.run_experiment(
                 config, progress=progress, resumed=resumed
             )
-        return output.finish(result, as_json=as_json) or self.experiment.exit_status(
-            result
-        )
+        return output.print_result(
+            result, as_json=as_json
+        ) or self.experiment.exit_status(result)
 
 
 GROUPS = {
@@ -323,7 +325,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     if argv is None:  # this process is ours
         open_descriptors()
-    with screens(), nothing_allowed():
+    with escape_output(), restrict_allowed_code():
         status = _interruptible(sys.argv[1:]) if argv is None else _status(list(argv))
         if argv is None:  # native code knows no handler of ours
             signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -370,13 +372,13 @@ def _run_and_tell(words: list[str]) -> int:
         return status
     except AdvsearchError as error:
         # late, so that --help answers at once
-        from advsearch.cli.flags import with_flags
+        from advsearch.cli.flags import format_as_flags
 
         # no file may name its own code
         asks_for_flag = isinstance(error, (UnknownNameError, CodeNotAllowedError))
         in_a_file = words[0] in ("run", "resume") and not asks_for_flag
-        text = str(error) if in_a_file else with_flags(str(error))
-        print(f"advsearch: error: {shortened(text)}", file=sys.stderr)
+        text = str(error) if in_a_file else format_as_flags(str(error))
+        print(f"advsearch: error: {shorten_words(text)}", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:
         return OK
@@ -404,7 +406,7 @@ def _run(words: list[str]) -> int:
 def _parse(words: list[str], command: str | None) -> argparse.Namespace:
     parser, subparsers = without_commands()
     for name in list_commands():
-        add_command(subparsers, name, whole=name == command)
+        add_command(subparsers, name, with_arguments=name == command)
     args, unknown = parser.parse_known_args(_join_negative_axis(words))
     if unknown:
         raise _unknown_argument(
@@ -466,12 +468,15 @@ def without_commands() -> tuple[
 
 
 def add_command(
-    subparsers: argparse._SubParsersAction[Any], name: str, *, whole: bool = True
+    subparsers: argparse._SubParsersAction[Any],
+    name: str,
+    *,
+    with_arguments: bool = True,
 ) -> argparse.ArgumentParser:
-    """Return the new parser of a command; if not `whole` it has no arguments, and
+    """Return the new parser of a command; if not `with_arguments` it has no arguments, and
     serves the list of commands.
     """
-    if not whole:
+    if not with_arguments:
         return cast(argparse.ArgumentParser, subparsers.add_parser(name))
     command = get_command(name)
     text = get_command_help(name)

@@ -23,7 +23,7 @@ from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
 from advsearch.errors import AdvsearchError, StorageError
 from advsearch.interrupts import INTERRUPTS
-from advsearch.progress import Progress, escaped, watched
+from advsearch.progress import Progress, escape_text, open_progress
 
 if TYPE_CHECKING:
     from advsearch.runs.results import Result
@@ -37,21 +37,21 @@ interrupted.
 """
 
 # most characters of a name in a message; of a longer one the ends are shown
-LONGEST_WORD = 300
+MAX_WORD_LENGTH = 300
 
 
-def shortened(text: str) -> str:
+def shorten_words(text: str) -> str:
     """Return a message with the middle of its overlong words left out."""
     return " ".join(
         word
-        if len(word) <= LONGEST_WORD
+        if len(word) <= MAX_WORD_LENGTH
         else f"{word[:100]}...{word[-40:]} ({len(word):,} characters)"
         for word in text.split(" ")
     )
 
 
 class Screen:
-    """A text stream that prints text `escaped`. All but writing is the stream's own.
+    """A text stream that prints text `escape_text`. All but writing is the stream's own.
     Unless it is `needed`, what cannot be written is dropped.
     """
 
@@ -61,7 +61,7 @@ class Screen:
 
     def write(self, text: str) -> int:
         with output_errors() if self._needed else suppress(OSError):
-            self.stream.write(escaped(text, self.stream.encoding or "utf-8"))
+            self.stream.write(escape_text(text, self.stream.encoding or "utf-8"))
         return len(text)
 
     def flush(self) -> None:
@@ -89,7 +89,7 @@ def output_errors() -> Iterator[None]:
 
 
 @contextmanager
-def screens() -> Iterator[None]:
+def escape_output() -> Iterator[None]:
     """Let everything that is printed inside the block go through a `Screen`."""
     stdout = sys.stdout
     stderr = sys.stderr
@@ -102,7 +102,7 @@ def screens() -> Iterator[None]:
         sys.stderr = stderr
 
 
-def raw(stream: IO[str]) -> IO[str]:
+def get_raw_stream(stream: IO[str]) -> IO[str]:
     """Return the stream behind a `Screen`, for what draws on a terminal and escapes
     names itself.
     """
@@ -169,7 +169,7 @@ def add_quiet_flags(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def say(
+def print_answer(
     as_json: bool, facts: Mapping[str, object], text: str, stream: IO[str] | None = None
 ) -> int:
     """Print what a command has to say: facts as JSON, or a text, on standard output or
@@ -184,9 +184,13 @@ def say(
 
 def print_json(value: Any) -> None:
     """Print `value` as JSON on standard output; NaN and infinity become null."""
-    from advsearch.runs.results import plain  # late, so that --help answers at once
+    from advsearch.runs.results import (
+        to_json_value,  # late, so that --help answers at once
+    )
 
-    text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
+    text = json.dumps(
+        to_json_value(value), indent=2, allow_nan=False, ensure_ascii=False
+    )
     text = "".join(
         sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1]
         for sign in text
@@ -195,39 +199,41 @@ def print_json(value: Any) -> None:
     print(text.replace("\x7f", "\\u007f"))
 
 
-def finish(result: Result, *, as_json: bool) -> int:
+def print_result(result: Result, *, as_json: bool) -> int:
     """Print a result, as JSON or as text for a person, and return the exit status."""
     if as_json:
         print_json(result)
     else:
-        print(shown_text(result) + go_on_text(result))
+        print(format_result(result) + explain_resume(result))
     stopped = getattr(result, "ending", None) == "interrupted"
     return INTERRUPTED if stopped else OK
 
 
-def go_on_text(result: Result) -> str:
+def explain_resume(result: Result) -> str:
     """Return how to go on with a run that was stopped; nothing of one that was not, or
     that is kept nowhere.
     """
     run: Any = getattr(result, "run", None)
-    stopped = run and result.goes_on and getattr(result, "ending", None) != "running"
-    return f"\n\nGo on with: {go_on_command(run)}" if stopped else ""
+    stopped = (
+        run and result.is_unfinished and getattr(result, "ending", None) != "running"
+    )
+    return f"\n\nGo on with: {make_resume_command(run)}" if stopped else ""
 
 
-def go_on_command(run: str | Path) -> str:
+def make_resume_command(run: str | Path) -> str:
     """Return the shell command that goes on with the run in a folder, with the Python
     code that its settings name.
     """
     # late, so that --help answers at once
-    from advsearch.cli.flags import command_in, config_of_file
+    from advsearch.cli.flags import read_command, read_file_config
     from advsearch.config import SceneConfig
-    from advsearch.runs.directory import CONFIG, typed_name
+    from advsearch.runs.directory import CONFIG, format_run_name
     from advsearch.settings import split_names
 
-    words = ["advsearch", "resume", typed_name(run)]
+    words = ["advsearch", "resume", format_run_name(run)]
     file = Path(run) / CONFIG
     with suppress(AdvsearchError):
-        config = config_of_file(command_in(file), file, {})
+        config = read_file_config(read_command(file), file, {})
         metrics = getattr(config, "metrics", {}).values()
         if isinstance(config, SceneConfig) and ":" in "".join(
             [config.model, *config.control_kinds, *metrics]
@@ -242,7 +248,7 @@ def go_on_command(run: str | Path) -> str:
 
 
 @contextmanager
-def output_kept_clean() -> Iterator[None]:
+def redirect_output() -> Iterator[None]:
     """Send whatever is printed inside the block to standard error, be it by Python or
     by a native library. So one JSON value, printed afterwards, is all that standard
     output holds.
@@ -264,45 +270,52 @@ def output_kept_clean() -> Iterator[None]:
             os.close(stdout_descriptor)
 
 
-def shown_text(result: Result) -> str:
+def format_result(result: Result) -> str:
     """Return what is shown of a result as text: what it says, its parts, by what it
     came about, and notes.
     """
     # late, so that --help answers at once
-    from advsearch.cli.flags import with_flags
-    from advsearch.report.views import facts_of, remarks_of, shown
+    from advsearch.cli.flags import format_as_flags
+    from advsearch.report.views import collect_facts, get_view, list_remarks
     from advsearch.runs.directory import REPORT
 
-    content = shown(result)
+    content = get_view(result)
     run = getattr(result, "run", None)
-    parts = [content.said]
+    parts = [content.statement]
     for part in content.sections:
-        if part.only not in ("", "text") or part.empty:
+        if part.only not in ("", "text") or part.is_empty:
             continue
-        table = aligned([part.heads, *part.rows] if part.heads else part.rows)
+        table = align_columns([part.heads, *part.rows] if part.heads else part.rows)
         pictures = [
             [picture.file, picture.caption]
             for group in part.pictures
             for picture in group
         ]
         inside = [
-            *map(with_flags, part.text),
-            "\n".join(filter(None, [table, aligned(pictures)])),
+            *map(format_as_flags, part.text),
+            "\n".join(filter(None, [table, align_columns(pictures)])),
         ]
         parts.append(
             "\n".join(filter(None, [part.title, "\n\n".join(filter(None, inside))]))
         )
-    facts = [[name.lower(), text] for name, text in facts_of(result, content).items()]
-    parts.append(aligned([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])]))
+    facts = [
+        [name.lower(), text] for name, text in collect_facts(result, content).items()
+    ]
+    parts.append(
+        align_columns([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])])
+    )
     return "\n\n".join(
         [
             *filter(None, parts),
-            *(f"Note: {with_flags(text)}" for text in remarks_of(result, content)),
+            *(
+                f"Note: {format_as_flags(text)}"
+                for text in list_remarks(result, content)
+            ),
         ]
     )
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> str:
+def align_columns(rows: Sequence[Sequence[str]]) -> str:
     """Return lines with the cells of `rows` in aligned columns."""
     wide = [
         max(len(row[i]) for row in rows if i < len(row))
@@ -320,23 +333,25 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
 
 
 @contextmanager
-def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
+def open_command_progress(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
     """Watch a command's work; where JSON is to be printed, keep everything else off
     standard output meanwhile.
     """
-    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
+    from advsearch.cli.flags import (
+        format_as_flags,  # late, so that --help answers at once
+    )
 
     with (
-        output_kept_clean() if as_json else nullcontext(),
-        watched(not quiet, with_flags) as watcher,
+        redirect_output() if as_json else nullcontext(),
+        open_progress(not quiet, format_as_flags) as watcher,
     ):
-        progress = LookingProgress(watcher)
+        progress = InterruptCheckingProgress(watcher)
         progress.stage("starting: loading PyTorch and Mitsuba")
         yield progress
         INTERRUPTS.look()
 
 
-class LookingProgress:
+class InterruptCheckingProgress:
     """A watcher that raises an interrupt which was lost where it struck, when a step or
     a stage ends: modules that are being imported, destructors and native code make
     other errors of one, or none. All is told to `progress`.

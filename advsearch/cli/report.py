@@ -92,7 +92,7 @@ def report(args: argparse.Namespace) -> int:
     _check_arguments(args, output_paths)
     exposure = {} if args.exposure is None else read_exposure(args.exposure)
     if args.photographs is not None:
-        _take_in(args.photographs, args.runs[0])
+        _add_photographs(args.photographs, args.runs[0])
     evidence, images = collect_evidence(
         args.runs,
         criterion=args.criterion,
@@ -116,7 +116,7 @@ def report(args: argparse.Namespace) -> int:
     for path, content in zip(output_paths, contents, strict=True):
         writing.write_text(path, content)
     text = _format_evidence(evidence, output_paths)
-    return output.say(args.json, evidence.to_dict(), text)
+    return output.print_answer(args.json, evidence.to_dict(), text)
 
 
 def _format_evidence(evidence: Any, output_paths: Sequence[Path]) -> str:
@@ -154,7 +154,7 @@ def _check_arguments(args: argparse.Namespace, output_paths: Sequence[Path]) -> 
         )
 
 
-def _take_in(folder: str, name: str) -> None:
+def _add_photographs(folder: str, name: str) -> None:
     """Have a run's model judge the photographs in a folder that the run does not have
     yet.
     """
@@ -167,7 +167,7 @@ def _take_in(folder: str, name: str) -> None:
     with tempfile.TemporaryDirectory() as temporary_folder:
         photograph_folder = Path(folder)
         if (photograph_folder / POSES).is_file():
-            photograph_folder = _named_by_pose(
+            photograph_folder = _copy_named_by_pose(
                 photograph_folder, run, Path(temporary_folder)
             )
         photographs = workbench.load_photographs()
@@ -189,7 +189,7 @@ def _take_in(folder: str, name: str) -> None:
         photographs.add_files(run, files)
 
 
-def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
+def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
     """Copy the photographs that `POSES` lists, each under the name of the rendering
     that has its pose.
     """
@@ -217,7 +217,9 @@ def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
         steps = [
             step
             for step, values in rows
-            if all(_is_at(values.get(name), text) for name, text in pose.items())
+            if all(
+                _is_equal_value(values.get(name), text) for name, text in pose.items()
+            )
         ]
         if len(steps) != 1:
             pose_text = ", ".join(f"{name} {text}" for name, text in pose.items())
@@ -231,7 +233,7 @@ def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
     return out
 
 
-def _is_at(value: object, text: str | None) -> bool:
+def _is_equal_value(value: object, text: str | None) -> bool:
     if text is None or value is None or isinstance(value, str):
         return text is not None and value == text.strip()
     try:

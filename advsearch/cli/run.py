@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from advsearch.cli import main, output
-from advsearch.cli.flags import command_in, config_of_file
+from advsearch.cli.flags import read_command, read_file_config
 from advsearch.cli.main import argument, command
 from advsearch.cli.show import show_run
 from advsearch.errors import InputError
 from advsearch.registry import get_experiment
 from advsearch.runs.directory import CONFIG, HOME, REPORT, find_run, read_python_only
-from advsearch.runs.listing import finished, listed_runs
+from advsearch.runs.listing import is_finished, list_runs
 from advsearch.settings import parse_assignment
 from advsearch.settings.values import set_dotted
 from advsearch.trust.code import allow_named
@@ -44,7 +44,7 @@ from advsearch.viewer.pages import write_page
     output.add_quiet_flags,
 )
 def run(args: argparse.Namespace) -> int:
-    changes = changes_in(args.change)
+    changes = parse_changes(args.change)
     if args.run is not None:
         changes["run"] = args.run
     if args.overwrite:
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     return run_file(args.file, changes, args)
 
 
-def changes_in(words: Sequence[str]) -> dict[str, object]:
+def parse_changes(words: Sequence[str]) -> dict[str, object]:
     """Return setting to value from ``NAME=VALUE``, which allows the code that they
     name. Raises InputError where a word is no such assignment.
     """
@@ -74,17 +74,17 @@ def run_file(
     UnknownNameError where there is no such command. If the file is a run's own,
     `resumed` is its folder; `args` has `json` and `quiet`.
     """
-    config = config_of_file(command_in(file), file, changes)
+    config = read_file_config(read_command(file), file, changes)
     for setting in config.left_out:
         if resumed is None or setting.name not in config.free:
             raise InputError(
-                f"{file}: {setting.name}: {setting.does}, which a file "
-                f"can't ask for; type {setting.ask}"
+                f"{file}: {setting.name}: {setting.effect}, which a file "
+                f"can't ask for; type {setting.how_to_set}"
             )
         if not args.quiet:
             print(
-                f"advsearch: {setting.name} is left out: it {setting.does}; type "
-                f"{setting.ask}",
+                f"advsearch: {setting.name} is left out: it {setting.effect}; type "
+                f"{setting.how_to_set}",
                 file=sys.stderr,
             )
     command = main.ExperimentCommand(get_experiment(config.command))
@@ -116,18 +116,18 @@ def resume(args: argparse.Namespace) -> int:
     result.
     """
     path = find_run(args.run)
-    changes = changes_in(args.change)
+    changes = parse_changes(args.change)
     if not (path / CONFIG).is_file():
         raise InputError(
             f"{path}: expected a run with its {CONFIG}, got none; start it again"
         )
-    command = command_in(path / CONFIG)
+    command = read_command(path / CONFIG)
     # the map of a sweep's surface, or a recipe's figures anew, with the photographs
     # that were taken since
     adds = command == "recipe" or (
         changes.get("surface") is True and command == "sweep"
     )
-    if finished(path) and not adds:
+    if is_finished(path) and not adds:
         print(f"advsearch: {path} is done already", file=sys.stderr)
         # the disk was full as it was written, or it was removed
         if not (path / REPORT).is_file():
@@ -158,7 +158,7 @@ def runs(args: argparse.Namespace) -> int:
         raise InputError(
             f"{folder}: expected a folder with runs in it, got no such folder"
         )
-    listed = listed_runs(folder)
+    listed = list_runs(folder)
     rows = [["run", "command", "object", "controls", "rows", "state", "result"]]
     for run in listed:
         names = ",".join(run.controls)
@@ -177,11 +177,11 @@ def runs(args: argparse.Namespace) -> int:
             ]
         )
     text = (
-        output.aligned(rows)
+        output.align_columns(rows)
         if listed
         else (f"no runs in {folder}/ yet; advsearch attack makes one")
     )
-    output.say(
+    output.print_answer(
         args.json, {"command": "runs", "runs": [vars(run) for run in listed]}, text
     )
     for run in listed:

@@ -18,7 +18,7 @@ from advsearch.catalog import is_present
 from advsearch.cli import output
 from advsearch.cli.flags import add_settings
 from advsearch.cli.main import argument, command
-from advsearch.cli.output import at_work, raw
+from advsearch.cli.output import get_raw_stream, open_command_progress
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import get_option_default, get_option_type, list_declared_options
@@ -29,10 +29,10 @@ from advsearch.registry import (
     get_first_doc_line,
     load_attribute,
 )
-from advsearch.report.wording import count, interval_text
+from advsearch.report.wording import format_count, format_interval
 from advsearch.runs.directory import IMAGES, PHOTOGRAPHS, find_run
-from advsearch.runs.listing import Listed, listed_run
-from advsearch.runs.results import plain
+from advsearch.runs.listing import ListedRun, read_listed_run
+from advsearch.runs.results import to_json_value
 from advsearch.runs.summary import NAME, read_result
 from advsearch.trust.code import allow_named
 
@@ -76,7 +76,7 @@ def show(args: argparse.Namespace) -> int:
             target := get_experiment(command).choice_description
         ):
             text, facts = load_attribute(target)(name)
-            return output.say(args.json, {command: name, **facts}, text)
+            return output.print_answer(args.json, {command: name, **facts}, text)
         case [name]:
             try:
                 return show_run(name, args.json, picture=args.picture)
@@ -97,19 +97,19 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     """
     path = find_run(name)
     if not (path / NAME).is_file():
-        return _show_unfinished(listed_run(path), as_json)
+        return _show_unfinished(read_listed_run(path), as_json)
     result = read_result(path)
-    photos = photos_of(path)
+    photos = find_photographs(path)
     if as_json:
         output.print_json(
             {**result.to_dict(), "photos": photos.to_dict()} if photos else result
         )
     else:
-        print(output.shown_text(result) + output.go_on_text(result))
+        print(output.format_result(result) + output.explain_resume(result))
     if photos and photos.interval is not None and not as_json:
         agreeing = photos.right_right + photos.wrong_wrong
-        total = count(photos.photos, "photograph")
-        sure = f"95 % interval {interval_text(photos.interval)}"
+        total = format_count(photos.photos, "photograph")
+        sure = f"95 % interval {format_interval(photos.interval)}"
         lines = [
             ["", "photograph right", "photograph wrong"],
             ["rendering right", str(photos.right_right), str(photos.right_wrong)],
@@ -117,14 +117,14 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
         ]
         print(
             f"\nRenderings and reality agree in {agreeing} of {total}, "
-            f"{sure}:\n{output.aligned(lines)}"
+            f"{sure}:\n{output.align_columns(lines)}"
         )
     if picture:
-        show_pictures(best_pictures(path))
+        show_pictures(find_best_images(path))
     return 0
 
 
-def photos_of(run: Path) -> Any:
+def find_photographs(run: Path) -> Any:
     """Return how photographs agree with the run's renderings
     (`advsearch.photo_agreement`); None where it has none.
     """
@@ -135,9 +135,11 @@ def photos_of(run: Path) -> Any:
     return photo_agreement(run)
 
 
-def _show_unfinished(run: Listed, as_json: bool) -> int:
+def _show_unfinished(run: ListedRun, as_json: bool) -> int:
     go_on = (
-        output.go_on_command(run.path) if run.begun and run.state == "stopped" else None
+        output.make_resume_command(run.path)
+        if run.begun and run.state == "stopped"
+        else None
     )
     subject = run.command
     if run.object:
@@ -156,7 +158,7 @@ def _show_unfinished(run: Listed, as_json: bool) -> int:
         lines += ["", f"Go on with: {go_on}"]
     elif run.state == "stopped":
         lines += ["", "It has no run.yaml, so it can't be resumed; start again."]
-    return output.say(
+    return output.print_answer(
         as_json,
         {**vars(run), "run": run.path, "ending": None, "resume": go_on},
         "\n".join(lines),
@@ -167,7 +169,7 @@ PLURALS = {"control": "controls", "policy": "policies", "task": "tasks"}
 
 
 def _show_declared(kind: str, name: str, as_json: bool) -> int:
-    with at_work(as_json=True, quiet=False):
+    with open_command_progress(as_json=True, quiet=False):
         registry = _registry(PLURALS[kind])  # takes seconds
     allow_named({"controls": name} if kind == "control" else {})
     if name not in registry:
@@ -177,13 +179,13 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
     facts: dict[str, object] = {kind: name}
     if kind == "control":
         facts |= {
-            "parameters": plain(entry.parameters),
-            "choices": plain(entry.choices),
+            "parameters": to_json_value(entry.parameters),
+            "choices": to_json_value(entry.choices),
         }
         if entry.parameters:
             parts.append(
                 "parameters, searched or fixed:\n"
-                + _table(list(map(_of_parameter, entry.parameters)))
+                + _format_table(list(map(_make_parameter_row, entry.parameters)))
             )
         else:
             parts.append(
@@ -191,26 +193,29 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
             )
         if entry.choices:
             parts.append(
-                "settings, chosen:\n" + _table(list(map(_of_choice, entry.choices)))
+                "settings, chosen:\n"
+                + _format_table(list(map(_make_choice_row, entry.choices)))
             )
     else:
         options = list[dict[str, Any]]()
         for option, field in list_declared_options(entry).items():
             default = get_option_default(field)
-            default = plain(getattr(default, "name", default))
+            default = to_json_value(getattr(default, "name", default))
             options.append(
                 {"name": option, "type": get_option_type(field), "default": default}
             )
         facts["options"] = options
-        rows = [{**option, "default": _cell(option["default"])} for option in options]
+        rows = [
+            {**option, "default": _format_cell(option["default"])} for option in options
+        ]
         how = f"options, as in --{kind} '{name}={{OPTION: VALUE}}':"
-        parts.append(f"{how}\n{_table(rows)}" if rows else "It has no options.")
-    return output.say(
+        parts.append(f"{how}\n{_format_table(rows)}" if rows else "It has no options.")
+    return output.print_answer(
         as_json, facts, "\n\n".join([f"{name}: {get_first_doc_line(entry)}", *parts])
     )
 
 
-def _of_parameter(parameter: Parameter) -> dict[str, str]:
+def _make_parameter_row(parameter: Parameter) -> dict[str, str]:
     """Return the row of a parameter in the table of its control, by column."""
     count = " x ".join("any" if side is None else str(side) for side in parameter.shape)
     allowed = ", ".join(parameter.options)
@@ -220,16 +225,16 @@ def _of_parameter(parameter: Parameter) -> dict[str, str]:
         "name": parameter.name,
         "unit": parameter.unit + (f" ({count})" if count else ""),
         "allowed": allowed,
-        "searched": _searched_text(parameter),
-        "default": _cell(parameter.default),
-        "periodic": _cell(parameter.periodic),
-        "moves outlines": _cell(parameter.moves_silhouettes),
+        "searched": _format_searched(parameter),
+        "default": _format_cell(parameter.default),
+        "periodic": _format_cell(parameter.periodic),
+        "moves outlines": _format_cell(parameter.moves_silhouettes),
         "derivative": "none" if parameter.options else ", ".join(parameter.estimators),
         "description": parameter.description,
     }
 
 
-def _searched_text(parameter: Parameter) -> str:
+def _format_searched(parameter: Parameter) -> str:
     """Return the range of a parameter that a search covers."""
     if parameter.search is None:
         return "if asked"
@@ -239,7 +244,7 @@ def _searched_text(parameter: Parameter) -> str:
     return f"{low:g} to {high:g}" + (", log" if parameter.log else "")
 
 
-def _of_choice(choice: Choice) -> dict[str, str]:
+def _make_choice_row(choice: Choice) -> dict[str, str]:
     allowed = ", ".join(choice.options)
     if choice.whole:
         allowed = f"{choice.whole[0]} to {choice.whole[1]}"
@@ -247,7 +252,7 @@ def _of_choice(choice: Choice) -> dict[str, str]:
         allowed = f"{-choice.most:g} to {choice.most:g}"
     elif choice.most:
         allowed = f"over 0 to {choice.most:g}"
-    default = _cell(choice.default)
+    default = _format_cell(choice.default)
     return {
         "name": choice.name,
         "allowed": allowed,
@@ -256,11 +261,11 @@ def _of_choice(choice: Choice) -> dict[str, str]:
     }
 
 
-def _table(rows: Sequence[Mapping[str, str]]) -> str:
-    return output.aligned([list(rows[0]), *(list(row.values()) for row in rows)])
+def _format_table(rows: Sequence[Mapping[str, str]]) -> str:
+    return output.align_columns([list(rows[0]), *(list(row.values()) for row in rows)])
 
 
-def _cell(value: JsonValue) -> str:
+def _format_cell(value: JsonValue) -> str:
     """Return a value as the text of a cell; None is empty."""
     if value is None:
         return ""
@@ -276,7 +281,7 @@ EXTRA = "pip install 'advsearch[terminal]'"
 FIRST = ("clean", "adversarial")
 
 
-def best_pictures(run: Path) -> list[Path]:
+def find_best_images(run: Path) -> list[Path]:
     """Return the pictures of a run that say most; none where it has none."""
     folder = run / IMAGES
     files = [folder / f"{name}.png" for name in FIRST]
@@ -324,7 +329,7 @@ def _drawing() -> tuple[Callable[[Path], None] | None, str]:
         )
     from rich.console import Console  # only where pictures are drawn
 
-    console = Console(file=raw(sys.stdout))
+    console = Console(file=get_raw_stream(sys.stdout))
     return lambda file: console.print(renderable.Image(file, height=HEIGHT)), ""
 
 
@@ -393,14 +398,15 @@ def list_all(args: argparse.Namespace) -> int:
         if args.kind == "all"
         else [args.kind]
     )
-    with at_work(as_json=True, quiet=False):
+    with open_command_progress(as_json=True, quiet=False):
         names = {kind: list_names(kind) for kind in kinds}
     tables = {
-        kind: output.aligned([*entries.items()]) for kind, entries in names.items()
+        kind: output.align_columns([*entries.items()])
+        for kind, entries in names.items()
     }
     text = "\n\n".join(f"{kind}:\n{table}" for kind, table in tables.items())
     facts = {kind: list(entries) for kind, entries in names.items()}
-    return output.say(
+    return output.print_answer(
         args.json, facts, text if args.kind == "all" else tables[args.kind]
     )
 
@@ -426,7 +432,7 @@ def labels(args: argparse.Namespace) -> int:
     """Print index and name of the classes, best first. Raises InputError where no class
     is like the word, or the model has no names for its classes.
     """
-    with at_work(as_json=True, quiet=False):
+    with open_command_progress(as_json=True, quiet=False):
         # late, so that --help answers at once
         from advsearch.models import load_model, read_labels
         from advsearch.models.labels import find_similar_labels, is_nothing_name
@@ -460,7 +466,9 @@ def labels(args: argparse.Namespace) -> int:
             "leave the word out to see all"
         )
     entries = [{"index": index, "label": name} for index, name in classes.items()]
-    text = output.aligned([[f"#{index}", name] for index, name in classes.items()])
-    return output.say(
+    text = output.align_columns(
+        [[f"#{index}", name] for index, name in classes.items()]
+    )
+    return output.print_answer(
         args.json, {"command": "labels", "word": args.word, "labels": entries}, text
     )

@@ -232,7 +232,7 @@ def open_workers(
         return
     executor: WorkerExecutor
     if cluster in (None, LOCAL):
-        executor = LocalExecutor(workers or threads.cores())
+        executor = LocalExecutor(workers or threads.count_cores())
     else:
         open_dask = load_attribute("advsearch.cluster.dask_executor:open_dask")
         executor, task = open_dask(task, workers, cluster, tell)

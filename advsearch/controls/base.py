@@ -44,7 +44,7 @@ from advsearch.controls.ranges import (
     parse_spec,
     to_plain_value,
 )
-from advsearch.copies import copied, hand_copies, is_ours
+from advsearch.copies import copy_value, hand_copies, is_ours
 from advsearch.distributions import distribution_to_setting
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import Value as Value
@@ -495,7 +495,7 @@ class Control:
     def with_scene(self, scene: SceneDescription) -> Self:
         """Return a copy that has a scene, without a slice of u yet."""
         in_scene = copy.copy(self)
-        in_scene.scene = scene if is_ours(type(self)) else copied(scene)
+        in_scene.scene = scene if is_ours(type(self)) else copy_value(scene)
         return in_scene
 
     def bind(self, scene: SceneDescription) -> Self:

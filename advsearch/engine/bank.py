@@ -30,7 +30,7 @@ from advsearch.scene.transport.matrix import (
     LinearRenderer,
     ProgressCallback,
 )
-from advsearch.trust.stored_files import scaled
+from advsearch.trust.stored_files import scale_limit
 
 INITIAL_CONDITIONS = (
     8  # conditions in the bank at first, as a multiple of those of an evaluation
@@ -284,7 +284,9 @@ class Bank(PredictedSearch):
                 self._conditions.append(condition)
                 self._bytes += condition.renderer.n_bytes
                 tick(SPP)
-                while len(self._conditions) > 1 and self._bytes > scaled(MAX_BYTES):
+                while len(self._conditions) > 1 and self._bytes > scale_limit(
+                    MAX_BYTES
+                ):
                     self._bytes -= self._conditions.pop(0).renderer.n_bytes
                     self._n_dropped += 1
 

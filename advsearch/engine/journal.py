@@ -37,7 +37,7 @@ from advsearch.engine.record import (
 from advsearch.errors import ClusterError, InputError
 from advsearch.models import Model, RemoteNetwork
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.store import Row, Told
+from advsearch.runs.store import CachedEvaluation, Row
 from advsearch.scene.color import to_uint8
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.together import Ensemble
@@ -325,7 +325,7 @@ class Journal:
         # once, and not for another problem of the same run
         if self.run is not None and not self._opened:
             self.machines |= self.get_note(MACHINES_NOTE) or {}
-            self._counts |= self.run.store.counts()
+            self._counts |= self.run.store.count_by_kind()
             self._opened = True
 
     # ---- queries
@@ -397,7 +397,7 @@ class Journal:
             return self._trials_of(query.kind).get(query.number)
         if self.run is None or query.number >= self._counts.get(query.kind, 0):
             return None
-        stored = self.run.store.told(query.kind, query.number)
+        stored = self.run.store.read_cached(query.kind, query.number)
         if stored is None:
             return None
         row, cached = stored
@@ -407,7 +407,7 @@ class Journal:
                 f"{query.kind} is not the one that "
                 "was stored, so advsearch, its packages or the number of threads have "
                 "changed since; "
-                f"{self.run.again}"
+                f"{self.run.restart_advice}"
             )
         if cached.non_finite:
             self.problem.renderer.non_finite += cached.non_finite
@@ -466,7 +466,7 @@ class Journal:
                 row_id = row.id or len(self.rows) + 1
                 self.rows.append(replace(row, id=row_id, time=time.time()))
         elif rows:
-            self.run.record(*rows, told=cached)
+            self.run.append_rows(*rows, cached=cached)
         return rows
 
     def _note_machine(self, name: str | None) -> None:
@@ -502,7 +502,9 @@ class Journal:
             seconds=evaluation.seconds,
         )
 
-    def _row_of_search(self, query: Query, evaluation: Evaluation) -> tuple[Row, Told]:
+    def _row_of_search(
+        self, query: Query, evaluation: Evaluation
+    ) -> tuple[Row, CachedEvaluation]:
         """Return the row of a search's evaluation, and what is stored with it."""
         problem = self.problem
         is_finite = evaluation.is_finite
@@ -528,7 +530,7 @@ class Journal:
         image = None
         if evaluation.picture is not None:
             image = to_uint8(evaluation.picture).numpy()
-        cached = Told(
+        cached = CachedEvaluation(
             query.number,
             compute_digest(query.u),
             evaluation.non_finite,
@@ -554,7 +556,7 @@ class Journal:
         if seconds is None:
             return None
         stored: Iterable[Row] = ()
-        if self.run is not None and self.run.store.goes_on:
+        if self.run is not None and self.run.store.has_cached:
             stored = self.run.store.rows(kind)
         phases = [(row.phase, row.seconds or 0.0) for row in stored]
         search_seconds = [spent for phase, spent in phases if phase == "search"]
@@ -590,12 +592,12 @@ class Journal:
 
     def get_note(self, key: str) -> Any:
         """Return the stored note of a key; None if there is none."""
-        return None if self.run is None else self.run.store.noted(key)
+        return None if self.run is None else self.run.store.read_json_note(key)
 
     def set_note(self, key: str, value: Any) -> None:
         """Store a value that JSON can hold as the note of a key."""
         if self.run is not None:
-            self.run.store.set_note(key, json.dumps(value))
+            self.run.store.write_note(key, json.dumps(value))
 
 
 def compute_digest(u: Tensor) -> bytes:

@@ -30,7 +30,7 @@ from advsearch.attacks.objectives import (
 )
 from advsearch.controls import Space
 from advsearch.controls.base import Control
-from advsearch.copies import copied
+from advsearch.copies import copy_value
 from advsearch.engine.loading import Scene
 from advsearch.engine.rendering import render
 from advsearch.errors import InputError, UnknownNameError
@@ -38,8 +38,8 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.features import features_of
 from advsearch.options import Value, check_takes
-from advsearch.report.wording import seen_text
-from advsearch.runs.export import AFTER, OWN
+from advsearch.report.wording import format_image_prediction
+from advsearch.runs.export import LEADING_COLUMNS, TRAILING_COLUMNS
 from advsearch.runs.results import PrintTerms
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import Surfaces
@@ -80,7 +80,7 @@ def metrics_to_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
         )
     settings = {}
     for name, function in metrics.items():
-        if name in (*OWN, *AFTER) or not name:
+        if name in (*LEADING_COLUMNS, *TRAILING_COLUMNS) or not name:
             raise InputError(
                 f"metrics: {name!r} is a column that rows have already; "
                 "choose another name"
@@ -257,7 +257,7 @@ def add_metrics(
     image_output, image_truth = _unbatch(output, truth)
     with torch.no_grad():
         for name, metric in metrics.items():
-            result = metric(*copied((image.detach(), image_output, image_truth)))
+            result = metric(*copy_value((image.detach(), image_output, image_truth)))
             if isinstance(result, Mapping):
                 returned |= {f"{name}.{key}": value for key, value in result.items()}
             else:
@@ -389,7 +389,9 @@ def check_truth(
         )
         predictions = rendering.views[0].predictions
         prediction_texts = ", ".join(
-            seen_text(task.name, replace(prediction, label=repr(prediction.label)))
+            format_image_prediction(
+                task.name, replace(prediction, label=repr(prediction.label))
+            )
             for prediction in predictions
         )
         first = predictions[0]

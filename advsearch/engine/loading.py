@@ -57,8 +57,8 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA, SettingValues
 from advsearch.settings import parse_controls, to_python
-from advsearch.trust.code import names_code
-from advsearch.trust.foreign_code import plainly
+from advsearch.trust.code import allow_code_of_call
+from advsearch.trust.foreign_code import use_plain_switches
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
 """One control or several, by name or instance; a mapping gives each name its settings
@@ -89,7 +89,7 @@ class Scene:
     description: SceneDescription
     is_session_only: bool = False
 
-    @names_code
+    @allow_code_of_call
     def renderer(
         self,
         controls: Controls,
@@ -118,7 +118,7 @@ class Scene:
         """
         resolution = to_python(resolution)
         description = fit_camera(self.description, resolution)
-        with plainly():
+        with use_plain_switches():
             space = make_space(make_controls(controls), description)
             return make_renderer(
                 description,
@@ -210,7 +210,7 @@ class Scene:
 
 
 @with_checked_arguments
-@plainly()
+@use_plain_switches()
 def load_scene(
     object: str | Path | ObjectAsset,
     environment: str | Path | EnvironmentAsset | None = None,
@@ -286,7 +286,7 @@ def load_scene(
         up=up,
         facing=facing,
         size=size,
-        given=fixed_values,
+        setting_values=fixed_values,
         unit=unit,
         plugins=mitsuba_dict,
         things=format_things(things),

@@ -41,7 +41,7 @@ from advsearch.scene.settings import Parameter, SettingValues
 from advsearch.settings import split_names
 from advsearch.tasks import Task
 from advsearch.tasks.together import EnsembleTask, join_models
-from advsearch.trust.foreign_code import plainly
+from advsearch.trust.foreign_code import use_plain_switches
 
 CONTROL = "control"
 MODEL = "model"
@@ -535,5 +535,5 @@ def hold_process_lock() -> Iterator[None]:
     Derivatives are on in it, whatever the caller has switched off (`torch.no_grad`,
     `torch.inference_mode`). torch and Dr.Jit have their threads again after it.
     """
-    with _PROCESS_LOCK, threads.given_back(), plainly():
+    with _PROCESS_LOCK, threads.restore_threads(), use_plain_switches():
         yield

@@ -20,7 +20,7 @@ from advsearch.attacks import (
 from advsearch.attacks.candidates import Bracket
 from advsearch.engine.transport import PredictedSearch
 from advsearch.options import NOT_A_NUMBER, Value, count_outcomes
-from advsearch.report.wording import count
+from advsearch.report.wording import format_count
 from advsearch.runs.results import ControlGroup, LinearTransport, VerifiedRate
 from advsearch.runs.store import Row
 from advsearch.scene.predictor import Refusal
@@ -102,7 +102,7 @@ def make_lost_remarks(n_lost: int) -> list[str]:
         return []
     verb, pronoun = ("has", "it") if n_lost == 1 else ("have", "them")
     return [
-        f"{count(n_lost, 'picture')} {verb} no answer, which counts as not right: "
+        f"{format_count(n_lost, 'picture')} {verb} no answer, which counts as not right: "
         f"every worker that took {pronoun} died."
     ]
 

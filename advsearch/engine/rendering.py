@@ -30,10 +30,10 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonObject
 from advsearch.models import Model, load_model
 from advsearch.options import Value
-from advsearch.progress import Watched, watcher
-from advsearch.report.figures import contact_sheet, marked
-from advsearch.report.wording import seen_text
-from advsearch.runs.files import png_bytes, write_exr, write_layers, write_png
+from advsearch.progress import ProgressOption, as_progress
+from advsearch.report.figures import draw_marks, make_contact_sheet
+from advsearch.report.wording import format_image_prediction
+from advsearch.runs.files import encode_png, write_exr, write_layers, write_png
 from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewPredictions
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.description import OBJECT, SceneDescription
@@ -45,8 +45,8 @@ from advsearch.scene.things import ALL_THINGS
 from advsearch.settings import to_python
 from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, Task, make_task
 from advsearch.tasks.together import make_each_thing_task
-from advsearch.trust.foreign_code import plainly
-from advsearch.trust.writing import placed_by
+from advsearch.trust.foreign_code import use_plain_switches
+from advsearch.trust.writing import name_setting_in_errors
 
 MAX_PREDICTIONS = 5  # predictions of the model that a view has at most
 
@@ -121,7 +121,7 @@ class Rendering:
             StorageError: it could not be written.
         """
         file = check_image_path(path, len(self.views))
-        with placed_by("out"):
+        with name_setting_in_errors("out"):
             if file.suffix.lower() == ".exr":
                 write_exr(file, self.views[0].linear)
                 return self.formation.resolution
@@ -145,7 +145,7 @@ class Rendering:
                 "aov: ground truth is written for a single view, rendered "
                 "with `aov`; leave `around` out"
             )
-        with placed_by("out"):
+        with name_setting_in_errors("out"):
             return write_layers(
                 Path(path).with_suffix(".aov.exr"),
                 surfaces.make_layers(aovs, OBJECT),
@@ -157,7 +157,7 @@ class Rendering:
 
         Azimuth and predictions are written under each.
         """
-        return contact_sheet(
+        return make_contact_sheet(
             [view.picture.numpy() for view in self.views], self._captions
         )
 
@@ -172,12 +172,12 @@ class Rendering:
         """
         if not any(view.marks for view in self.views):
             return None
-        images = [marked(view.picture.numpy(), view.marks) for view in self.views]
+        images = [draw_marks(view.picture.numpy(), view.marks) for view in self.views]
         image = images[0]
         if len(images) > 1:
-            image = contact_sheet(images, self._captions)
+            image = make_contact_sheet(images, self._captions)
         file = Path(path).with_name(f"{Path(path).stem}-prediction.png")
-        with placed_by("out"):
+        with name_setting_in_errors("out"):
             write_png(file, image)
         return file
 
@@ -199,7 +199,7 @@ class Rendering:
         return f"Rendering({names} says {', '.join(labels)}, {height} x {width} pixels)"
 
     def _repr_png_(self) -> bytes:
-        return png_bytes(self._png_pixels)
+        return encode_png(self._png_pixels)
 
     @property
     def _captions(self) -> list[list[str]]:
@@ -207,7 +207,8 @@ class Rendering:
         captions = []
         for view in self.views:
             texts = [
-                seen_text(self.task, prediction) for prediction in view.predictions
+                format_image_prediction(self.task, prediction)
+                for prediction in view.predictions
             ]
             captions.append([f"azimuth {view.azimuth:g}", *texts])
         return captions
@@ -280,7 +281,7 @@ class _RenderedView(NamedTuple):
     truth_error: str
 
 
-@plainly()
+@use_plain_switches()
 def render(
     scene: Scene | str | Path,
     model: Model | nn.Module | str | Path = "reference",
@@ -298,7 +299,7 @@ def render(
     seed: int = 0,
     aov: bool = False,
     at: Tensor | None = None,
-    progress: Watched = None,
+    progress: ProgressOption = None,
 ) -> Rendering:
     """Render a scene and predict with a model what it shows.
 
@@ -357,7 +358,7 @@ def render(
         with_surfaces=aov,
         at=at,
     )
-    progress = watcher(progress)
+    progress = as_progress(progress)
     progress.stage("rendering", around or 1)
     views = list[View]()
     truth_warnings = list[str]()

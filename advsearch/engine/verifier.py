@@ -33,9 +33,9 @@ from advsearch.attacks.trials import (
     OVER_LADDER,
     SampleCount,
     choose_rate_spp,
+    count_max_samples,
     limit_ladder,
     make_margin_function,
-    most_samples,
 )
 from advsearch.cluster import Workers
 from advsearch.engine.journal import Journal, ParallelEvaluator
@@ -44,7 +44,7 @@ from advsearch.engine.record import MAX_STORED_IMAGES, RunState
 from advsearch.engine.transport import PredictedSearch
 from advsearch.errors import InputError
 from advsearch.progress import Progress, Stages
-from advsearch.report.wording import count as plural
+from advsearch.report.wording import format_count as plural
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_configuration
 from advsearch.scene.color import round_to_8_bit
@@ -168,7 +168,7 @@ class Verifier:
             max_samples = N_CONDITIONS * len(candidates) * sum(ladder)
         else:
             choose = partial(choose_spp, trials=n_trials)
-            max_samples = most_samples(len(candidates), ladder, n_trials)
+            max_samples = count_max_samples(len(candidates), ladder, n_trials)
         if len(ladder) > 1:
             hint = (
                 "more and more samples a pixel until noise no longer moves the result "

@@ -4,7 +4,7 @@ of models needs. Torch only.
 
 from __future__ import annotations
 
-from advsearch.errors import CodeNotAllowedError, resembling
+from advsearch.errors import CodeNotAllowedError, find_similar_names
 from advsearch.interrupts import INTERRUPTS
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.features import PARTS, pooled
@@ -40,17 +40,17 @@ from advsearch.models.source import (
     make_source,
     split_weights,
 )
-from advsearch.pictures import png_of, upright
+from advsearch.pictures import encode_levels, load_upright
 from advsearch.trust.archives import without_unpickling
-from advsearch.trust.code import how_to_allow, may_fetch
-from advsearch.trust.foreign_code import first_line, foreign
+from advsearch.trust.code import explain_how_to_allow, is_fetch_allowed
+from advsearch.trust.foreign_code import get_first_line, translate_errors
 from advsearch.trust.network import (
     KEY,
     NoRedirect,
     check_address,
-    connecting,
     is_local,
     read_key,
+    restrict_connections,
 )
 
 __all__ = [
@@ -74,29 +74,29 @@ __all__ = [
     "Triple",
     "WithState",
     "check_address",
-    "connecting",
     "copy_sharing_weights",
+    "encode_levels",
+    "explain_how_to_allow",
     "find_label_set",
     "find_near_names",
     "find_similar_labels",
-    "first_line",
-    "foreign",
+    "find_similar_names",
+    "get_first_line",
     "get_patterns",
-    "how_to_allow",
     "import_library",
+    "is_fetch_allowed",
     "is_local",
     "is_nothing_name",
     "load_model",
+    "load_upright",
     "load_weights",
     "make_source",
-    "may_fetch",
-    "png_of",
     "pooled",
     "read_key",
     "read_labels",
-    "resembling",
+    "restrict_connections",
     "split_weights",
-    "upright",
+    "translate_errors",
     "warn",
     "without_unpickling",
 ]

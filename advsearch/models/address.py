@@ -92,11 +92,11 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         ModelError: it cannot do the task, or there is no answer.
     """
     address = models.check_address(spec)
-    if not models.may_fetch(spec):
+    if not models.is_fetch_allowed(spec):
         raise models.CodeNotAllowedError(
             f"a file names the model {spec}, to which pictures would be sent, and the "
             f"key in {models.KEY}; "
-            f"{models.how_to_allow(spec)}"
+            f"{models.explain_how_to_allow(spec)}"
         )
     chat = address.path.endswith(CHAT_SUFFIX)
     name = address.fragment or address.netloc
@@ -388,7 +388,7 @@ class AddressModel(models.RemoteNetwork):
 
     def _make_body(self, image: Image8Bit) -> dict[str, Any]:
         """Return the JSON body of a request about an image."""
-        encoded = base64.b64encode(models.png_of(image)).decode()
+        encoded = base64.b64encode(models.encode_levels(image)).decode()
         if not self.chat:
             body: dict[str, Any] = {"image": encoded}
             if self.question:
@@ -685,7 +685,7 @@ class AddressModel(models.RemoteNetwork):
         if models.is_local(request.host.rpartition(":")[0].strip("[]") or request.host):
             handlers.append(urllib.request.ProxyHandler({}))
         opener = urllib.request.build_opener(*handlers)
-        max_size = stored_files.scaled(MAX_ANSWER_BYTES)
+        max_size = stored_files.scale_limit(MAX_ANSWER_BYTES)
         content = bytearray()
         with opener.open(request, timeout=self.limits["seconds"]) as response:
             while chunk := response.read1(1 << 16):

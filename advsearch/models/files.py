@@ -31,12 +31,12 @@ from advsearch.trust import exported_programs
 from advsearch.trust.archives import (
     LARGEST,
     Archive,
+    make_archive_error,
     open_archive,
-    refused,
-    rewritten_torchscript,
+    rewrite_torchscript,
     without_unpickling,
 )
-from advsearch.trust.foreign_code import foreign, try_torchscript
+from advsearch.trust.foreign_code import translate_errors, try_torchscript
 from advsearch.trust.stored_files import open_regular
 
 #: Suffixes that make a name a file even if there is no such file.
@@ -96,7 +96,7 @@ def load_file(path: Path) -> Source:
         archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
         if _find_archive_kind(archive) == "torchscript":
             return _load_torchscript(archive)
-        checked = exported_programs.rewritten(archive)
+        checked = exported_programs.rewrite_program(archive)
         logger = logging.getLogger("torch.export")
         with (
             _report_corrupt(path, "torch.export"),
@@ -126,7 +126,7 @@ def _hint_of_missing(path: Path) -> str:
 def _load_torchscript(archive: Archive) -> Source:
     """Load the network in a TorchScript archive."""
     path = archive.path
-    checked, runs_while_loading = rewritten_torchscript(archive)
+    checked, runs_while_loading = rewrite_torchscript(archive)
     if runs_while_loading:
         problem = try_torchscript(checked)
         if problem:
@@ -157,7 +157,7 @@ def _find_archive_kind(archive: Archive) -> str:
             if n.startswith("data/aotinductor/") or Path(n).name.startswith(kinds)
         ]
         if compiled:
-            raise refused(
+            raise make_archive_error(
                 path,
                 f"holds {min(compiled)!r}, which is a pickled object "
                 "or compiled code and never loaded",
@@ -341,7 +341,7 @@ def _report_corrupt(path: Path, kind: str) -> AbstractContextManager[None]:
         "damaged, made by another version, or in need of unpickling, which is "
         "never done"
     )
-    return foreign(f"{problem}; {causes}", kind=FileFormatError)
+    return translate_errors(f"{problem}; {causes}", kind=FileFormatError)
 
 
 FLOATS = {
@@ -441,7 +441,7 @@ def _open_session(path: Path) -> tuple[Any, Any]:
         f"model file {path}: cannot be read as ONNX with onnxruntime "
         f"{runtime.__version__}"
     )
-    with foreign(problem, kind=FileFormatError):
+    with translate_errors(problem, kind=FileFormatError):
         # Constants are computed in each call, which has a deadline: nothing could end
         # the creation of a session.
         session = runtime.InferenceSession(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from advsearch.errors import FileFormatError, InputError, resembling
+from advsearch.errors import FileFormatError, InputError, find_similar_names
 from advsearch.trust.stored_files import parse_json, read_text
 
 # the text that a name is put into where nothing else is said
@@ -107,7 +107,7 @@ def find_label_set(
 def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     """Find the classes whose names resemble a word, best first, then its synonyms.
 
-    Resemblance is that of `resembling`; synonyms ("cup" for "mug") come from a table of
+    Resemblance is that of `find_similar_names`; synonyms ("cup" for "mug") come from a table of
     everyday things.
 
     Returns:
@@ -126,7 +126,7 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
         names = [_normalize_name(name) for name in group]
         if key in names:
             synonyms += [name for name in names if name in table]
-    similar = resembling(word, table)
+    similar = find_similar_names(word, table)
     # If nothing contains the word, the similar names are only spelled like it.
     if synonyms and not any(key in name for name in similar):
         similar = []

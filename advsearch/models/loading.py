@@ -14,7 +14,12 @@ from typing import Any
 from torch import Tensor, nn
 
 from advsearch.catalog import list_built_ins
-from advsearch.errors import InputError, ModelError, UnknownNameError, resembling
+from advsearch.errors import (
+    InputError,
+    ModelError,
+    UnknownNameError,
+    find_similar_names,
+)
 from advsearch.models import files, reference
 from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
 from advsearch.models.labels import (
@@ -35,7 +40,11 @@ from advsearch.models.source import (
     split_weights,
 )
 from advsearch.registry import Registry, load_attribute
-from advsearch.trust.foreign_code import called_under, plainly, turned_by_code
+from advsearch.trust.foreign_code import (
+    call_with_switches,
+    find_code_switches,
+    use_plain_switches,
+)
 
 DEFAULT_INPUT_SIZE = (224, 224)  # if neither the model nor the caller states one
 
@@ -57,7 +66,7 @@ FORMS = (
 )
 
 
-@plainly()
+@use_plain_switches()
 def load_model(
     spec: str | os.PathLike[str] | nn.Module | Model,
     *,
@@ -147,7 +156,7 @@ def load_model(
         ask or {},
     )
     source = _find_source(spec, purpose)
-    switches = turned_by_code()
+    switches = find_code_switches()
     if isinstance(source, Source):
         reads_text = source.reads_text
     else:
@@ -158,7 +167,7 @@ def load_model(
             "reads no text; leave `prompt` out"
         )
     if isinstance(source, Source) and isinstance(source.module, nn.Module):
-        called_under(source.module, switches)
+        call_with_switches(source.module, switches)
     if task:
         source = replace(source, module=task.wrap_network(source.module))
     if (
@@ -323,7 +332,7 @@ def _unknown_model(text: str) -> UnknownNameError:
     names = ["reference", *(forms.get(source, f"{source}:NAME") for source in SOURCES)]
     hint = FORMS
     may_be_of_library = re.fullmatch(r"[\w.-]+", text)
-    if may_be_of_library and not resembling(text, ["reference"]):
+    if may_be_of_library and not find_similar_names(text, ["reference"]):
         hint = (
             "A library's network is written with its library: "
             f"'torchvision:{text}' or 'timm:{text}'. {FORMS}"

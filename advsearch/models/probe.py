@@ -27,8 +27,8 @@ from advsearch.models.model import (
     read_output,
     warn,
 )
-from advsearch.trust.foreign_code import TookTooLong, first_line, within
-from advsearch.trust.stored_files import FACTOR, scaled
+from advsearch.trust.foreign_code import TimedOut, get_first_line, run_within_limits
+from advsearch.trust.stored_files import FACTOR, scale_limit
 
 # Non-negative rows that sum to 1 within this tolerance are probabilities.
 PROBABILITY_TOLERANCE = 1e-3
@@ -145,11 +145,11 @@ def _check_batch_size(model: Model) -> None:
     """Raise ModelError if the smallest batch of a model has too many pixels."""
     height, width = model.input_size
     count = max(model.batch_limits[0], 1)
-    if count * height * width > scaled(MAX_PIXELS):
+    if count * height * width > scale_limit(MAX_PIXELS):
         raise ModelError(
             f"model {model.name}: takes {count:,} images of {height:,} x {width:,} "
             "pixels at once, expected at most "
-            f"{scaled(MAX_PIXELS):,} pixels; if you trust it, {FACTOR}=10 in the "
+            f"{scale_limit(MAX_PIXELS):,} pixels; if you trust it, {FACTOR}=10 in the "
             "environment allows ten times "
             "as many"
         )
@@ -260,8 +260,12 @@ def _call_guarded(model: Model, call: Callable[[], Any]) -> Any:
     network = _unwrap(model.module)
     try:
         stop = getattr(network, "stop", None)
-        return within(call, stop) if stop or isinstance(network, PROGRAMS) else call()
-    except TookTooLong as error:
+        return (
+            run_within_limits(call, stop)
+            if stop or isinstance(network, PROGRAMS)
+            else call()
+        )
+    except TimedOut as error:
         raise ModelError(f"model {model.name}: {error}") from None
     except Exception as error:  # any network may raise anything
         (height, width) = model.input_size
@@ -285,7 +289,7 @@ def _call_guarded(model: Model, call: Callable[[], Any]) -> Any:
             why = f"cannot be run on a {picture}"
         advice = f". Give the {made_for} that it was made for" if made_for else ""
         raise ModelError(
-            f"model {model.name}: {why} ({first_line(error)}){advice}"
+            f"model {model.name}: {why} ({get_first_line(error)}){advice}"
         ) from error
 
 
@@ -518,7 +522,7 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
                 # What the network detaches may be all that has a gradient.
                 if not (repeatable and detaching.has_detached):
                     raise
-                reason = first_line(error)
+                reason = get_first_line(error)
                 with torch.no_grad():
                     rows = _run(model, images)
                 gradient = torch.zeros_like(images)
@@ -533,7 +537,7 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
             _check_gradient(model, images, gradient, is_detached)
     except (RuntimeError, ModelError) as error:
         has_gradient = False
-        reason = first_line(error)
+        reason = get_first_line(error)
         networks = (model.module, getattr(model.module, "network", None))
         if any(type(network) is EightBitInput for network in networks):
             reason = (

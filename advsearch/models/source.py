@@ -31,7 +31,7 @@ from advsearch.errors import (
     InputError,
     ModelError,
     UnknownNameError,
-    resembling,
+    find_similar_names,
 )
 from advsearch.models.inputs import takes_image_size
 from advsearch.models.model import (
@@ -45,7 +45,7 @@ from advsearch.models.model import (
 )
 from advsearch.trust.archives import LARGEST
 from advsearch.trust.code import check_import, current_directory_importable
-from advsearch.trust.foreign_code import first_line
+from advsearch.trust.foreign_code import get_first_line
 from advsearch.trust.stored_files import open_regular
 
 # what is asked where nothing else is said
@@ -208,7 +208,7 @@ def freeze_network(module: nn.Module, name: str) -> nn.Module:
             copy.Error,
         ) as error:  # locks, files
             warn(
-                f"model {name} cannot be copied ({first_line(error)}): the module "
+                f"model {name} cannot be copied ({get_first_line(error)}): the module "
                 "itself is set to evaluation mode and "
                 "its parameters are frozen"
             )
@@ -232,7 +232,7 @@ def load_weights(module: nn.Module, path: Path, name: str) -> None:
     except (SafetensorError, OSError) as error:
         raise FileFormatError(
             f"weights {path} of model {name}: expected a complete safetensors file "
-            f"({first_line(error)}); "
+            f"({get_first_line(error)}); "
             "make one with safetensors.torch.save_file(module.state_dict(), path)"
         ) from None
     own = module.state_dict()
@@ -330,7 +330,7 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
             if error.name is not None and (
                 name == error.name or name.startswith(error.name + ".")
             ):
-                near = resembling(name, libraries)
+                near = find_similar_names(name, libraries)
                 meant = (
                     f"; did you mean '{near[0]}:{spec.partition(':')[2]}'?"
                     if near
@@ -349,7 +349,7 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
 
 def _where(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
-    return first_line(error) + (
+    return get_first_line(error) + (
         f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
     )
 
@@ -376,7 +376,7 @@ def import_library(name: str, spec: str, extra: str) -> Any:
             ) from error
         raise ModelError(
             f"model {spec}: needs {name}, which cannot be imported here "
-            f"({first_line(error)}). Install builds that fit "
+            f"({get_first_line(error)}). Install builds that fit "
             f"each other: {command}, torch's own index where that has them; or export "
             "the network with torch.export "
             f"where {name} works, and give the .pt2 file"

@@ -5,7 +5,12 @@ from __future__ import annotations
 from advsearch.config import RenderConfig
 from advsearch.experiment import RunContext, experiment
 from advsearch.report.views import ResultPart, ShownResult
-from advsearch.report.wording import SEEN, seen_cells, seen_text, things_rows
+from advsearch.report.wording import (
+    VISIBLE_HEADS,
+    format_image_prediction,
+    format_image_prediction_cells,
+    format_thing_rows,
+)
 from advsearch.runs.results import RenderResult
 
 
@@ -21,18 +26,27 @@ def make_view(result: RenderResult) -> ShownResult:
         rows = [
             [
                 f"{view.azimuth:g}",
-                "; ".join(seen_text(result.task, answer) for answer in view.answers),
+                "; ".join(
+                    format_image_prediction(result.task, answer)
+                    for answer in view.answers
+                ),
             ]
             for view in result.views
         ]
         heads = ("azimuth", f"model {result.model} sees")
         return ShownResult(headline, [ResultPart(heads=heads, rows=rows)])
     (view,) = result.views
-    predictions = [seen_cells(result.task, answer) for answer in view.answers]
+    predictions = [
+        format_image_prediction_cells(result.task, answer) for answer in view.answers
+    ]
     sections = [ResultPart(f"Model {result.model} sees", rows=predictions)]
     if view.things is not None:
-        things = things_rows({name: vars(thing) for name, thing in view.things.items()})
-        sections.append(ResultPart("In the picture", heads=("", *SEEN), rows=things))
+        things = format_thing_rows(
+            {name: vars(thing) for name, thing in view.things.items()}
+        )
+        sections.append(
+            ResultPart("In the picture", heads=("", *VISIBLE_HEADS), rows=things)
+        )
     return ShownResult(headline, sections)
 
 

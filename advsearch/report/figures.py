@@ -60,7 +60,7 @@ def new_axes() -> Any:
     return plt.subplots(layout="constrained")[1]
 
 
-def drawn(
+def render_figure(
     draw: Callable[[Figure], object],
     size: tuple[float, float],
     kinds: Sequence[str] = ("png", "svg"),
@@ -94,7 +94,7 @@ SERIES = (BLUE, RED, "#1f7a45", "#b4540a", "#6b3fa0", GREY)
 MARKS = "os^DvP"  # What tells series apart
 
 
-def draw_shares(
+def draw_fractions(
     axes: Any,
     rows: Mapping[str, Sequence[tuple[float, Sequence[float]] | None]],
     series: Sequence[str],
@@ -128,7 +128,7 @@ def draw_shares(
     axes.grid(True, axis="x")
 
 
-def search_axes(
+def draw_searches(
     objectives: Mapping[str, Sequence[float | None]],
     meaning: str,
     axes: Any,
@@ -191,8 +191,8 @@ def search_axes(
 
 
 def _select_points(count: int) -> npt.NDArray[np.int_]:
-    """Return the indices of at most `MOST_POINTS` of the values, evenly spaced."""
-    positions = np.linspace(0, count - 1, min(count, MOST_POINTS))
+    """Return the indices of at most `MAX_POINTS` of the values, evenly spaced."""
+    positions = np.linspace(0, count - 1, min(count, MAX_POINTS))
     return np.unique(positions.round().astype(int))
 
 
@@ -204,16 +204,16 @@ def _as_dots(values: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
 MARGIN = "margin [logits]; below 0: wrong"
 ACCURACY = "accuracy"
 """What the colours of a map may mean: red is wrong in both."""
-MOST_POINTS = 400  # Values of an axis that are drawn
+MAX_POINTS = 400  # Values of an axis that are drawn
 
 
-def heat(
+def draw_heat_map(
     axes: Any,
     values: Sequence[Sequence[float]],
     extent: tuple[float, ...],
     meaning: str,
-    across: str,
-    up: str,
+    x_label: str,
+    y_label: str,
 ) -> None:
     """Draw values as colours, rows from the lowest, with what they mean and the names
     of both axes.
@@ -225,17 +225,17 @@ def heat(
         limit = max([*finite, 1e-6])
         colours = {"cmap": "RdBu", "vmin": -limit, "vmax": limit}
     image = axes.imshow(values, origin="lower", extent=extent, aspect="auto", **colours)
-    axes.set(xlabel=across, ylabel=up)
+    axes.set(xlabel=x_label, ylabel=y_label)
     axes.figure.colorbar(image, ax=axes, label=meaning)
 
 
-def axis_title(name: str, unit: str) -> str:
+def format_axis_title(name: str, unit: str) -> str:
     """Return what an axis is called: ``pose.yaw [degrees]``."""
     return f"{name} [{unit}]" if unit not in ("", "name") else name
 
 
-def figure_of(draw: Callable[[Any], object], size: tuple[float, float]) -> Figures:
-    return drawn(lambda figure: draw(figure.subplots()), size)
+def render_axes(draw: Callable[[Any], object], size: tuple[float, float]) -> Figures:
+    return render_figure(lambda figure: draw(figure.subplots()), size)
 
 
 # --------------------------------------------------------------------------------
@@ -243,22 +243,22 @@ def figure_of(draw: Callable[[Any], object], size: tuple[float, float]) -> Figur
 # said; or several on a sheet.
 
 Floats = npt.NDArray[np.float32]
-TRUE = (0, 190, 255)
-SAID = (255, 110, 0)
+TRUE_COLOR = (0, 190, 255)
+PREDICTED_COLOR = (255, 110, 0)
 """Colours of what is true and of what the model says; told apart in any kind of colour
 vision.
 """
 # Pixels of the longest side at least; smaller pictures are magnified, so that text can
 # be read
-SMALLEST = 512
+MIN_IMAGE_SIDE = 512
 # How much of a tint covers a picture; how many letters are as high as its longest side
 TINT = 0.45
-LETTERS = 28
+LETTERS_PER_SIDE = 28
 Box = tuple[float, float, float, float]
 Shape = Any  # What is drawn, a box or the pixels of a mask: `advsearch.tasks.Mark`
 
 
-def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
+def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
     """Return a picture (H, W, 3), display-referred sRGB in [0, 1], with shapes drawn
     into it, magnified where it is small: (h, w, 3) float32.
 
@@ -268,13 +268,13 @@ def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
     first, in greys of one range: that of what is true.
     """
     levels = to_8bit(picture)
-    factor = max(1, -(-SMALLEST // max(levels.shape[:2])))
+    factor = max(1, -(-MIN_IMAGE_SIDE // max(levels.shape[:2])))
     size = levels.shape[1] * factor, levels.shape[0] * factor
     image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
     for shape in sorted(shapes, key=lambda shape: shape.true):
         if shape.mask is not None:
             _draw_mask(image, shape)
-    font = ImageFont.load_default(max(size) // LETTERS)
+    font = ImageFont.load_default(max(size) // LETTERS_PER_SIDE)
     _draw_boxes(image, shapes, factor, font)
     panels = [image, *_make_map_panels(shapes, size, font)]
     sheet: Floats = np.hstack(
@@ -290,7 +290,7 @@ def _draw_mask(image: Image.Image, shape: Shape) -> None:
     strength = mask * TINT
     if shape.true:
         strength = _find_outline(mask).astype(float)
-    colour = Image.new("RGB", image.size, TRUE if shape.true else SAID)
+    colour = Image.new("RGB", image.size, TRUE_COLOR if shape.true else PREDICTED_COLOR)
     opacity = Image.fromarray(np.rint(255.0 * strength).astype(np.uint8))
     image.paste(colour, (0, 0), opacity)
 
@@ -315,15 +315,17 @@ def _draw_boxes(
     """Draw the boxes of shapes, and then their texts, of which none covers another."""
     draw = ImageDraw.Draw(image)
     boxes = [
-        (shape, _corners(shape.box, factor, image.size))
+        (shape, _to_pixel_corners(shape.box, factor, image.size))
         for shape in shapes
         if shape.box is not None
     ]
     for shape, corners in boxes:
-        draw.rectangle(corners, outline=TRUE if shape.true else SAID, width=2)
+        draw.rectangle(
+            corners, outline=TRUE_COLOR if shape.true else PREDICTED_COLOR, width=2
+        )
     text_boxes: list[tuple[int, int, int, int]] = []
     for shape, corners in boxes:
-        text_box = _write(draw, shape, corners, image.size, font, text_boxes)
+        text_box = _write_label(draw, shape, corners, image.size, font, text_boxes)
         text_boxes.append(text_box)
 
 
@@ -347,12 +349,14 @@ def _make_map_panels(
         grey_image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
         panel = grey_image.convert("RGB")
         frame = (0, 0, size[0] - 1, size[1] - 1)
-        _write(ImageDraw.Draw(panel), shape, frame, size, font, [])
+        _write_label(ImageDraw.Draw(panel), shape, frame, size, font, [])
         panels.append(panel)
     return panels
 
 
-def _corners(box: Box, factor: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
+def _to_pixel_corners(
+    box: Box, factor: int, size: tuple[int, int]
+) -> tuple[int, int, int, int]:
     """Return the first and last pixels of a box in the magnified image, inside of
     it.
     """
@@ -365,7 +369,7 @@ def _corners(box: Box, factor: int, size: tuple[int, int]) -> tuple[int, int, in
     return left, top, max(left, right), max(top, bottom)
 
 
-def _write(
+def _write_label(
     draw: ImageDraw.ImageDraw,
     shape: Shape,
     corners: tuple[int, int, int, int],
@@ -396,7 +400,10 @@ def _write(
         range(max(size[1] - height, 0) + 1), key=lambda y: (abs(y - preferred_y), y)
     )
     y = next(filter(is_free, nearest_first), preferred_y)
-    draw.rectangle((x, y, x + width, y + height), fill=TRUE if shape.true else SAID)
+    draw.rectangle(
+        (x, y, x + width, y + height),
+        fill=TRUE_COLOR if shape.true else PREDICTED_COLOR,
+    )
     draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)
     return x, y, x + width, y + height
 
@@ -406,10 +413,10 @@ LINE = 15
 FONT = 12
 # Pixels that a tile is wide at least, so that its text can be read; smaller pictures
 # are magnified
-NARROWEST = 160
+MIN_TILE_WIDTH = 160
 
 
-def contact_sheet(
+def make_contact_sheet(
     pictures: Sequence[Floats], captions: Sequence[Sequence[str]]
 ) -> Floats:
     """Return pictures side by side on white, each over lines of text, as float32.
@@ -419,10 +426,10 @@ def contact_sheet(
             ones are magnified.
         captions: lines of each picture; what is too long for the tile is cut.
     """
-    factor = math.ceil(NARROWEST / pictures[0].shape[1])
+    factor = math.ceil(MIN_TILE_WIDTH / pictures[0].shape[1])
     height, width = (factor * side for side in pictures[0].shape[:2])
     cell = width + GAP, height + LINE * max(map(len, captions)) + GAP
-    n_columns = columns_for(len(pictures))
+    n_columns = choose_column_count(len(pictures))
     n_rows = math.ceil(len(pictures) / n_columns)
     sheet_size = GAP + n_columns * cell[0], GAP + n_rows * cell[1]
     sheet = Image.new("RGB", sheet_size, "white")
@@ -468,7 +475,7 @@ def _write_caption(
         draw.text((left, top + LINE * index), text, fill="black", font=font)
 
 
-def columns_for(count: int) -> int:
+def choose_column_count(count: int) -> int:
     """Return in how many columns `count` tiles stand: about the square root, and a
     divisor of the count if one is near.
     """

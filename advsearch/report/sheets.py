@@ -35,10 +35,10 @@ FOOT = 20.0
 SQUARE = 50.0  # Side of the square that is measured with a ruler, millimetres
 RULER = 100.0
 # Length of a mark where to cut, and its distance from the bleed, millimetres
-MARK = 5.0
-AWAY = 1.0
-MOST_SHEETS = 200  # Sheets that are written unless more are asked for
-SHEETS_EVER = 10_000
+MARK_LENGTH = 5.0
+MARK_GAP = 1.0
+DEFAULT_MAX_SHEETS = 200  # Sheets that are written unless more are asked for
+MAX_SHEETS = 10_000
 CHECKLIST = (
     "\u2610 Print all pages, and measure the square.",
     "\u2610 Photograph the colour chart on the last page: upright and whole, in even "
@@ -52,7 +52,7 @@ CHECKLIST = (
     "and renderings agree.",
 )
 """What is to be done, to tick off."""
-LARGEST_PROFILE = 16 << 20
+MAX_PROFILE_BYTES = 16 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +79,13 @@ class Piece:
     @property
     def frame(self) -> tuple[float, float]:
         """Bleed and marks on each side, millimetres: across and down."""
-        return self.bleed[0] * self.pixel[0] + AWAY + MARK, self.bleed[1] * self.pixel[
+        return self.bleed[0] * self.pixel[0] + MARK_GAP + MARK_LENGTH, self.bleed[
             1
-        ] + AWAY + MARK
+        ] * self.pixel[1] + MARK_GAP + MARK_LENGTH
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedPart:
     """A part of a piece on a page, with the name that is printed beside it.
 
     Trim: first and last column and row of the part within the piece's picture,
@@ -115,27 +115,27 @@ def write_sheets(
     *,
     paper: str = "a4",
     profile: Path | None = None,
-    most: int = MOST_SHEETS,
-    last: Callable[[str, tuple[float, float], Any], Figure] | None = None,
+    max_sheets: int = DEFAULT_MAX_SHEETS,
+    make_last_page: Callable[[str, tuple[float, float], Any], Figure] | None = None,
 ) -> int:
     """Write the PDF of at least one piece, and return how many pages it has.
 
     Colours are converted into an ICC `profile` of an RGB printer; None leaves them
-    sRGB. At most so many sheets, 1 to `SHEETS_EVER`, may follow the first page, which
-    has the title. `last` makes one more page, of the title, the size of the paper and
+    sRGB. At most so many sheets, 1 to `MAX_SHEETS`, may follow the first page, which
+    has the title. `make_last_page` makes one more page, of the title, the size of the paper and
     the conversion of the profile, if any. Raises InputError where there is no such
     paper, or there would be more sheets, and FileFormatError where the profile is none
     of an RGB printer.
     """
     if paper not in PAPERS:
         raise InputError(f"paper: expected one of {', '.join(PAPERS)}, got {paper!r}")
-    if not 1 <= most <= SHEETS_EVER:
+    if not 1 <= max_sheets <= MAX_SHEETS:
         raise InputError(
-            f"sheets: expected a whole number from 1 to {SHEETS_EVER}, got {most}"
+            f"sheets: expected a whole number from 1 to {MAX_SHEETS}, got {max_sheets}"
         )
     convert: Any = None
     if profile is not None:
-        data = read_bytes(profile, "an ICC profile", LARGEST_PROFILE)
+        data = read_bytes(profile, "an ICC profile", MAX_PROFILE_BYTES)
         try:
             printer = ImageCms.ImageCmsProfile(io.BytesIO(data))
             convert = ImageCms.buildTransform(
@@ -145,20 +145,20 @@ def write_sheets(
             raise FileFormatError(
                 f"{profile}: expected the ICC profile of an RGB printer ({error})"
             ) from None
-    pages = list(pages_of(pieces, PAPERS[paper]))
-    if len(pages) > most:
+    pages = list(arrange_pages(pieces, PAPERS[paper]))
+    if len(pages) > max_sheets:
         raise InputError(
-            f"sheets: it takes {len(pages)} sheets of {paper}, and up to {most} are "
+            f"sheets: it takes {len(pages)} sheets of {paper}, and up to {max_sheets} are "
             "written; say that so many are "
             f"wanted (`sheets={len(pages)}`), or give a larger `paper` or a smaller "
             "`size`"
         )
     with PdfPages(path, metadata={"Title": title, "CreationDate": None}) as file:
-        file.savefig(_cover(pieces, title, PAPERS[paper], len(pages), profile))
+        file.savefig(_make_cover(pieces, title, PAPERS[paper], len(pages), profile))
         for number, page in enumerate(pages, 1):
-            figure, axes = blank(PAPERS[paper])
+            figure, axes = make_blank_page(PAPERS[paper])
             for part in page:
-                _draw(axes, part, convert)
+                _draw_part(axes, part, convert)
             right, bottom = (side - MARGIN for side in PAPERS[paper])
             axes.text(
                 right,
@@ -168,25 +168,25 @@ def write_sheets(
                 ha="right",
                 va="bottom",
             )
-            _ruler(axes, PAPERS[paper])
+            _draw_ruler(axes, PAPERS[paper])
             file.savefig(figure)
-        if last is not None:
-            file.savefig(last(title, PAPERS[paper], convert))
-    return len(pages) + 1 + (last is not None)
+        if make_last_page is not None:
+            file.savefig(make_last_page(title, PAPERS[paper], convert))
+    return len(pages) + 1 + (make_last_page is not None)
 
 
-def pages_of(
+def arrange_pages(
     pieces: Sequence[Piece], paper: tuple[float, float]
-) -> Iterator[list[Placed]]:
+) -> Iterator[list[PlacedPart]]:
     """Yield what is on each page: rows of parts, the highest first, from the upper
     left. Raises InputError where a pixel is larger than a page, or there would be more
-    than `SHEETS_EVER` pages.
+    than `MAX_SHEETS` pages.
     """
     width = paper[0] - 2 * MARGIN
     height = paper[1] - 2 * MARGIN - FOOT
-    parts = [part for piece in pieces for part in _parts(piece, width, height)]
+    parts = [part for piece in pieces for part in _cut_piece(piece, width, height)]
     parts.sort(key=lambda part: -part.extent[1])
-    page: list[Placed] = []
+    page: list[PlacedPart] = []
     x = y = row = 0.0
     for part in parts:
         across, down = part.extent
@@ -208,7 +208,7 @@ def pages_of(
         yield page
 
 
-def _parts(piece: Piece, width: float, height: float) -> Iterator[Placed]:
+def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart]:
     """Cut a piece into equal parts that fit on a page with bleed and marks.
 
     The cuts lie between pixels. Width and height of the page are in millimetres.
@@ -220,16 +220,16 @@ def _parts(piece: Piece, width: float, height: float) -> Iterator[Placed]:
     )
     rows = _cut_evenly(n_rows - 2 * top, (height - 2 * piece.frame[1]) / piece.pixel[1])
     n_parts = len(columns) * len(rows)
-    if n_parts > SHEETS_EVER:
+    if n_parts > MAX_SHEETS:
         raise InputError(
-            f"size: it would take more than {SHEETS_EVER} sheets; give a smaller one"
+            f"size: it would take more than {MAX_SHEETS} sheets; give a smaller one"
         )
     for row, (y0, y1) in enumerate(rows, 1):
         for column, (x0, x1) in enumerate(columns, 1):
             name = piece.name
             if n_parts > 1:
                 name += f", row {row} of {len(rows)}, column {column} of {len(columns)}"
-            yield Placed(piece, name, (left + x0, left + x1, top + y0, top + y1))
+            yield PlacedPart(piece, name, (left + x0, left + x1, top + y0, top + y1))
 
 
 def _cut_evenly(length: int, max_length: float) -> list[tuple[int, int]]:
@@ -248,7 +248,7 @@ def _cut_evenly(length: int, max_length: float) -> list[tuple[int, int]]:
     return list(itertools.pairwise(bounds))
 
 
-def blank(paper: tuple[float, float]) -> tuple[Figure, Axes]:
+def make_blank_page(paper: tuple[float, float]) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(paper[0] / INCH, paper[1] / INCH))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
@@ -257,20 +257,20 @@ def blank(paper: tuple[float, float]) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _line(axes: Axes, xs: Sequence[float], ys: Sequence[float]) -> None:
+def _draw_line(axes: Axes, xs: Sequence[float], ys: Sequence[float]) -> None:
     axes.plot(
         xs, ys, color="black", linewidth=0.4, solid_capstyle="butt", clip_on=False
     )
 
 
-def _cover(
+def _make_cover(
     pieces: Sequence[Piece],
     title: str,
     paper: tuple[float, float],
     sheets: int,
     profile: Path | None,
 ) -> Figure:
-    figure, axes = blank(paper)
+    figure, axes = make_blank_page(paper)
     x = MARGIN
     y = MARGIN + 5.0
     axes.text(x, y, title, fontsize=14, va="top")
@@ -293,22 +293,24 @@ def _cover(
     top = y + 15.0
     right = x + SQUARE
     bottom = y + 15.0 + SQUARE
-    _line(axes, [x, right, right, x, x], [top, top, bottom, bottom, top])
+    _draw_line(axes, [x, right, right, x, x], [top, top, bottom, bottom, top])
     axes.text(x, bottom + 10.0, "\n".join(lines), fontsize=9, va="top", linespacing=1.6)
-    _ruler(axes, paper)
+    _draw_ruler(axes, paper)
     return figure
 
 
-def _ruler(axes: Axes, paper: tuple[float, float]) -> None:
+def _draw_ruler(axes: Axes, paper: tuple[float, float]) -> None:
     x = MARGIN
     y = paper[1] - MARGIN
-    _line(axes, [x, x + RULER], [y, y])
+    _draw_line(axes, [x, x + RULER], [y, y])
     for step in range(int(RULER) // 10 + 1):
-        _line(axes, [x + 10.0 * step] * 2, [y, y - (4.0 if step % 5 == 0 else 2.5)])
+        _draw_line(
+            axes, [x + 10.0 * step] * 2, [y, y - (4.0 if step % 5 == 0 else 2.5)]
+        )
     axes.text(x + RULER + 3.0, y, f"{RULER:g} mm", fontsize=7, va="bottom")
 
 
-def _draw(axes: Axes, part: Placed, convert: Any) -> None:
+def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
     """Draw a part on its page: image with bleed, marks, line to cut along and name."""
     piece = part.piece
     x0, x1, y0, y1 = part.trim
@@ -330,7 +332,7 @@ def _draw(axes: Axes, part: Placed, convert: Any) -> None:
     _draw_cut_marks(axes, trim_x, trim_y, outer_x, outer_y)
     if piece.inside is not None:
         _draw_cut_line(axes, part, piece.inside[y0:y1, x0:x1])
-    axes.text(part.x, outer_y[0] - AWAY, part.name, fontsize=6, va="bottom")
+    axes.text(part.x, outer_y[0] - MARK_GAP, part.name, fontsize=6, va="bottom")
 
 
 def _draw_cut_marks(
@@ -343,13 +345,19 @@ def _draw_cut_marks(
     """Draw two marks at each corner, outside of the bleed, in line with the trim."""
     for x, edge_x, sign_x in zip(trim_x, outer_x, (-1.0, 1.0), strict=True):
         for y, edge_y, sign_y in zip(trim_y, outer_y, (-1.0, 1.0), strict=True):
-            mark_x = [edge_x + sign_x * AWAY, edge_x + sign_x * (AWAY + MARK)]
-            mark_y = [edge_y + sign_y * AWAY, edge_y + sign_y * (AWAY + MARK)]
-            _line(axes, mark_x, [y, y])
-            _line(axes, [x, x], mark_y)
+            mark_x = [
+                edge_x + sign_x * MARK_GAP,
+                edge_x + sign_x * (MARK_GAP + MARK_LENGTH),
+            ]
+            mark_y = [
+                edge_y + sign_y * MARK_GAP,
+                edge_y + sign_y * (MARK_GAP + MARK_LENGTH),
+            ]
+            _draw_line(axes, mark_x, [y, y])
+            _draw_line(axes, [x, x], mark_y)
 
 
-def _draw_cut_line(axes: Axes, part: Placed, inside: Mask) -> None:
+def _draw_cut_line(axes: Axes, part: PlacedPart, inside: Mask) -> None:
     """Draw the outline of what is cut out of a part, (rows, columns)."""
     n_rows, n_columns = inside.shape
     pixel_width, pixel_height = part.piece.pixel

@@ -1,7 +1,7 @@
 """What a person is shown of a result: said once, and set as text, as a page and in a
 notebook by whoever shows it.
 
-A question has `shown(result)` in its `result`; of one that has not, the fields of its
+A question has `get_view(result)` in its `result`; of one that has not, the fields of its
 result are shown as they are called and described. All rules of wording claims are here
 too: sentences that a run stands for, and no more than that.
 A claim is one of four kinds:
@@ -38,12 +38,12 @@ from advsearch.report.figures import (
     GREY,
     RED,
     Figures,
-    drawn,
-    figure_of,
     new_axes,
+    render_axes,
+    render_figure,
 )
-from advsearch.report.wording import share_text as share_text
-from advsearch.runs.files import png_bytes
+from advsearch.report.wording import format_extent as format_extent
+from advsearch.runs.files import encode_png
 from advsearch.runs.results import (
     INTERRUPTED,
     RUNNING,
@@ -60,8 +60,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LONG = 24  # Rows of a table of fields above which it is folded
-_ELSEWHERE = (
+MAX_UNFOLDED_ROWS = 24  # Rows of a table of fields above which it is folded
+_FIELDS_ELSEWHERE = (
     *(
         "run",
         "object",
@@ -142,7 +142,7 @@ class ResultPart:
     only: str = ""
 
     @classmethod
-    def table(
+    def make_table(
         cls, rows: Iterable[Any], columns: Mapping[str, Column], **more: Any
     ) -> ResultPart:
         """Return a table, a row for each of some values, with columns by their heads,
@@ -158,7 +158,7 @@ class ResultPart:
         return cls(heads=tuple(columns), rows=cells, **more)
 
     @property
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether there is nothing to show."""
         return not (
             any(self.text) or self.rows or self.pictures or self.draw or self.live
@@ -171,11 +171,11 @@ class ShownResult:
     sections, and by name what it was done with, beside what all questions have
     (environment, renders, time and seed). Cautions have to be known beside the
     warnings; `about` is what it is of, in a few names, and empty: the object, the
-    controls and the model. Where `says_interrupted`, `said` states by itself that an
+    controls and the model. Where `says_interrupted`, `statement` states by itself that an
     interrupted run was interrupted.
     """
 
-    said: str
+    statement: str
     sections: Sequence[ResultPart] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     about: Sequence[str] = ()
@@ -183,13 +183,13 @@ class ShownResult:
     says_interrupted: bool = False
 
 
-def shown(result: Result) -> ShownResult:
-    make_view = registry.get_experiment(result.command).view or fields_shown
+def get_view(result: Result) -> ShownResult:
+    make_view = registry.get_experiment(result.command).view or make_default_view
     view: ShownResult = make_view(result)
     return view
 
 
-def remarks_of(result: Result, view: ShownResult) -> list[str]:
+def list_remarks(result: Result, view: ShownResult) -> list[str]:
     """Return what to know of a result before it is used: its state, cautions,
     warnings.
     """
@@ -205,7 +205,7 @@ def remarks_of(result: Result, view: ShownResult) -> list[str]:
     return [*remarks, *view.cautions, *getattr(result, "warnings", ())]
 
 
-def subject_of(result: Result, view: ShownResult) -> list[str]:
+def list_subjects(result: Result, view: ShownResult) -> list[str]:
     """Return what a result is about: its own names, or object, controls and model."""
     if view.about:
         return [*view.about]
@@ -217,7 +217,7 @@ def subject_of(result: Result, view: ShownResult) -> list[str]:
     return subjects
 
 
-def facts_of(result: Result, view: ShownResult) -> dict[str, str]:
+def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
     """Return what a result was made with, by name, the facts of its view first."""
     renders = getattr(result, "renders", None)
     seconds = getattr(result, "seconds", None)
@@ -228,8 +228,8 @@ def facts_of(result: Result, view: ShownResult) -> dict[str, str]:
     common_facts = {
         "environment": environment,
         "renders": "" if n_renders is None else str(n_renders),
-        "workers": wording.workers_text(getattr(result, "shared", None)),
-        "time": wording.seconds_text(seconds["total"]) if seconds else "",
+        "workers": wording.format_workers(getattr(result, "shared", None)),
+        "time": wording.format_seconds(seconds["total"]) if seconds else "",
         "seed": str(getattr(result, "seed", "")),
         **result.facts(),
     }
@@ -238,7 +238,7 @@ def facts_of(result: Result, view: ShownResult) -> dict[str, str]:
     return {name: text for name, text in facts.items() if text}
 
 
-def fields_shown(result: Result) -> ShownResult:
+def make_default_view(result: Result) -> ShownResult:
     """Return the view of a result that has none of its own.
 
     Its lists are tables, its other fields facts, and a last table says what their names
@@ -272,9 +272,9 @@ def _find_plain_facts(
 ) -> dict[str, str]:
     """Return the fields of a result that no table and no heading has, as texts."""
     fact_names = [name.replace(" ", "_") for name in result.facts()]
-    elsewhere = {*_ELSEWHERE, *tables, *fact_names}
+    elsewhere = {*_FIELDS_ELSEWHERE, *tables, *fact_names}
     return {
-        _words(name): _text(value)
+        _format_name(name): _format_value(value)
         for name, value in values.items()
         if name not in elsewhere
     }
@@ -286,11 +286,19 @@ def _make_table(name: str, rows: Sequence[Fields]) -> ResultPart:
     columns = [
         column
         for column in names
-        if any(_text(getattr(row, column, None)) for row in rows)
+        if any(_format_value(getattr(row, column, None)) for row in rows)
     ]
-    cells = [[_text(getattr(row, column, None)) for column in columns] for row in rows]
-    heads = list(map(_words, columns))
-    return ResultPart(_words(name), heads=heads, rows=cells, folded=len(rows) > LONG)
+    cells = [
+        [_format_value(getattr(row, column, None)) for column in columns]
+        for row in rows
+    ]
+    heads = list(map(_format_name, columns))
+    return ResultPart(
+        _format_name(name),
+        heads=heads,
+        rows=cells,
+        folded=len(rows) > MAX_UNFOLDED_ROWS,
+    )
 
 
 def _explain_words(described: Iterable[tuple[Fields, set[str]]]) -> ResultPart:
@@ -302,26 +310,31 @@ def _explain_words(described: Iterable[tuple[Fields, set[str]]]) -> ResultPart:
     meanings = dict[str, str]()
     for fields, words in described:
         for name, about in type(fields).described().items():
-            if about.description and _words(name) in words:
-                meanings.setdefault(_words(name), about.description.replace("`", ""))
+            if about.description and _format_name(name) in words:
+                meanings.setdefault(
+                    _format_name(name), about.description.replace("`", "")
+                )
     rows = [[word, meaning] for word, meaning in meanings.items()]
     return ResultPart("What these words mean", rows=rows, folded=True, only="page")
 
 
-def _text(value: object) -> str:
+def _format_value(value: object) -> str:
     if value is None:
         return ""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return "" if value != value else wording.number_text(value)
+        return "" if value != value else wording.format_number(value)
     if isinstance(value, Formation):
-        return wording.formation_text(value)
+        return wording.format_formation(value)
     if isinstance(value, Fields):
-        return _text({name: getattr(value, name) for name in type(value).model_fields})
+        return _format_value(
+            {name: getattr(value, name) for name in type(value).model_fields}
+        )
     if isinstance(value, Mapping):
         texts = {
-            _words(str(name)).lower(): _text(inner) for name, inner in value.items()
+            _format_name(str(name)).lower(): _format_value(inner)
+            for name, inner in value.items()
         }
         return ", ".join(f"{name} {text}" for name, text in texts.items() if text)
     if isinstance(value, (list, tuple)):
@@ -330,11 +343,11 @@ def _text(value: object) -> str:
             if len(value) == 2 and all(isinstance(inner, float) for inner in value)
             else "; "
         )
-        return between.join(filter(None, map(_text, value)))
+        return between.join(filter(None, map(_format_value, value)))
     return str(value)
 
 
-def _words(name: str) -> str:
+def _format_name(name: str) -> str:
     words = name.replace("_", " ").replace("-", " ")
     return words[:1].upper() + words[1:]
 
@@ -352,7 +365,7 @@ class Claim(Fields):
     extent: Extent | None = Field(description="null where nothing was counted")
 
     @classmethod
-    def of_case(
+    def from_case(
         cls, name: str, ending: str, rate: VerifiedRate | None, spent: str | None = None
     ) -> Claim:
         """Return the claim about one adversarial scene of several.
@@ -363,16 +376,16 @@ class Claim(Fields):
             rate: of its trials.
             spent: what was searched; None for a scene that was only tried again.
         """
-        return case_claim(name, ending, rate, spent)
+        return make_case_claim(name, ending, rate, spent)
 
 
-NOTHING = "Nothing is claimed"
+NOTHING_CLAIMED = "Nothing is claimed"
 NO_PROOF = "This does not show that there is none."
 # Endings of a search that ran to its end without finding anything
-ENDED = ("budget spent", "stalled")
+FAILED_SEARCH_ENDINGS = ("budget spent", "stalled")
 
 
-WHY = {
+REASON_OF_ENDING = {
     "already wrong": "the model is wrong about the clean scene already",
     "interrupted": "it was interrupted",
     "out of time": "its time was up before its end",
@@ -381,53 +394,58 @@ WHY = {
 }
 
 
-def case_claim(
+def make_case_claim(
     name: str, ending: str, rate: VerifiedRate | None, spent: str | None
 ) -> Claim:
     """One adversarial scene of many. `spent` is what was searched; None where nothing
     was, and a scene was only tried again.
     """
-    extent = extent_of("fresh renders that count as a success", rate)
+    extent = make_rate_extent("fresh renders that count as a success", rate)
     if ending == "found" and rate is not None and rate.successes:
         return claim(
             "found",
-            f"{name}: an adversarial scene holds in {wording.rate_text(rate)}.",
+            f"{name}: an adversarial scene holds in {wording.format_rate(rate)}.",
             extent,
         )
-    if rate is not None and spent is None and ending in (*ENDED, "not verified"):
+    if (
+        rate is not None
+        and spent is None
+        and ending in (*FAILED_SEARCH_ENDINGS, "not verified")
+    ):
         return claim(
             "measured",
             f"{name}: the adversarial scene is not confirmed, in "
-            f"{wording.rate_text(rate)}.",
+            f"{wording.format_rate(rate)}.",
             extent,
         )
-    if rate is not None and ending in ENDED:
+    if rate is not None and ending in FAILED_SEARCH_ENDINGS:
         text = (
             f"{name}: no failure was found; the best configuration counts in "
-            f"{wording.rate_text(rate)}."
+            f"{wording.format_rate(rate)}."
         )
         return claim("not found", f"{text} Searched were {spent}. {NO_PROOF}", extent)
-    return nothing_claimed(
-        WHY.get(ending, f"it ended as {ending!r}"), f"This is about {name}."
+    return make_no_claim(
+        REASON_OF_ENDING.get(ending, f"it ended as {ending!r}"),
+        f"This is about {name}.",
     )
 
 
-def average_claim(case: AverageCase, name: str) -> Claim:
+def make_average_claim(case: AverageCase, name: str) -> Claim:
     what = "configurations in which the model is right"
-    extent = counted(what, case.correct, case.configurations, case.interval)
+    extent = make_extent(what, case.correct, case.configurations, case.interval)
     text = (
-        f"{name}: the model is right in {share_text(extent)} configurations drawn "
+        f"{name}: the model is right in {format_extent(extent)} configurations drawn "
         "by chance"
     )
     return claim("measured", f"{text} from the whole space and budget.", extent)
 
 
-def searches_text(renders: Mapping[str, int], policy: str, random: bool) -> str:
+def format_searches(renders: Mapping[str, int], policy: str, random: bool) -> str:
     """Return how much was searched: ``24 renders by the policy auto and 24 by random
     search``, and how many images were predicted instead.
     """
     n_renders = renders.get("search", 0) + renders.get("gradient", 0)
-    text = f"{wording.count(n_renders, 'render')} by the policy {policy}"
+    text = f"{wording.format_count(n_renders, 'render')} by the policy {policy}"
     if renders.get("products"):
         text += f", {renders['products']} more predicted,"
     if random:
@@ -435,15 +453,15 @@ def searches_text(renders: Mapping[str, int], policy: str, random: bool) -> str:
     return text
 
 
-def extent_of(what: str, rate: VerifiedRate | None) -> Extent | None:
+def make_rate_extent(what: str, rate: VerifiedRate | None) -> Extent | None:
     return (
         None
         if rate is None
-        else counted(what, rate.successes, rate.trials, rate.interval)
+        else make_extent(what, rate.successes, rate.trials, rate.interval)
     )
 
 
-def counted(
+def make_extent(
     what: str,
     count: int,
     total: int,
@@ -453,9 +471,11 @@ def counted(
     return Extent.from_count(what, count, total, interval, share)
 
 
-def nothing_claimed(why: str, more: str = "") -> Claim:
+def make_no_claim(why: str, more: str = "") -> Claim:
     return claim(
-        "nothing claimed", f"{NOTHING}: {why}.{' ' + more if more else ''}", None
+        "nothing claimed",
+        f"{NOTHING_CLAIMED}: {why}.{' ' + more if more else ''}",
+        None,
     )
 
 
@@ -464,7 +484,7 @@ def claim(kind: Kind, text: str, extent: Extent | None) -> Claim:
 
 
 # --------------------------------------------------------------------------------
-# HTML that is escaped by construction: text becomes markup only through `element`.
+# HTML that is escaped by construction: text becomes markup only through `make_element`.
 #
 # And results as a notebook shows them (what is said, pictures or a figure, and tables,
 # without styles), and charts that stand inline in a page; their colours come from its
@@ -479,7 +499,7 @@ class Html(str):
     __slots__ = ()
 
 
-def element(tag: str, *children: str | None, **attributes: str | float) -> Html:
+def make_element(tag: str, *children: str | None, **attributes: str | float) -> Html:
     """Return one element. Children that are not `Html` are escaped; None is left out.
     Of attributes ``class_`` is ``class``, and other underscores become hyphens.
     """
@@ -504,10 +524,10 @@ def join_html(*parts: str | None) -> Html:
     )
 
 
-SHOWN = 224  # Width of a picture on the page, in pixels
+DISPLAY_WIDTH = 224  # Width of a picture on the page, in pixels
 GAP = 4  # White between pictures, in pixels
-PIXELS = 94  # Of a chart's height, to an inch of the figure
-WIDTH = 6.2  # Of a figure, in inches
+PIXELS_PER_INCH = 94  # Of a chart's height, to an inch of the figure
+FIGURE_WIDTH = 6.2  # Of a figure, in inches
 
 
 class InNotebook:
@@ -526,7 +546,7 @@ class InNotebook:
             axes: to draw on; None makes new ones.
         """
         axes = new_axes() if axes is None else axes
-        draw = next((part.draw for part in shown(self).sections if part.draw), None)  # type: ignore[arg-type]
+        draw = next((part.draw for part in get_view(self).sections if part.draw), None)  # type: ignore[arg-type]
         if draw is not None:
             draw(axes)
         return axes
@@ -548,13 +568,13 @@ class InNotebook:
         return json_normalize([row.to_dict() for row in rows])
 
     def _repr_html_(self) -> str:
-        return result_html(shown(self))  # type: ignore[arg-type]
+        return make_notebook_html(get_view(self))  # type: ignore[arg-type]
 
     def _repr_png_(self) -> bytes | None:
-        return result_figure(shown(self)).get("png")  # type: ignore[arg-type]
+        return render_result_figure(get_view(self)).get("png")  # type: ignore[arg-type]
 
 
-def result_html(
+def make_notebook_html(
     view: ShownResult, pictures: Mapping[str, ArrayLike] | None = None
 ) -> str:
     """Return a result as HTML for a notebook: its sentence, pictures, figure,
@@ -562,59 +582,68 @@ def result_html(
     """
     figures = []
     for name, image in (pictures or {}).items():
-        picture = _picture(png_bytes(image), SHOWN, name)
-        caption = element("figcaption", name)
+        picture = _make_image(encode_png(image), DISPLAY_WIDTH, name)
+        caption = make_element("figcaption", name)
         figures.append(
-            element("figure", picture, caption, style="display:inline-block")
+            make_element("figure", picture, caption, style="display:inline-block")
         )
-    figure = result_figure(view)
+    figure = render_result_figure(view)
     chart = None
     if figure:
-        chart = _picture(figure["png"], 2 * SHOWN, "the numbers of the table")
+        chart = _make_image(
+            figure["png"], 2 * DISPLAY_WIDTH, "the numbers of the table"
+        )
     sections = [
         _make_section_html(part)
         for part in view.sections
-        if part.only in ("", "notebook") and not part.empty
+        if part.only in ("", "notebook") and not part.is_empty
     ]
-    return element("div", element("p", view.said), *figures, chart, *sections)
+    return make_element(
+        "div", make_element("p", view.statement), *figures, chart, *sections
+    )
 
 
 def _make_section_html(part: ResultPart) -> Html:
     """Return the texts and the table of a part of a result as HTML."""
-    children = [element("p", text) for text in part.text if text and part.draw is None]
+    children = [
+        make_element("p", text) for text in part.text if text and part.draw is None
+    ]
     if part.rows:
-        heads = element("tr", *(element("th", cell) for cell in part.heads))
-        head = element("thead", heads) if part.heads else None
+        heads = make_element("tr", *(make_element("th", cell) for cell in part.heads))
+        head = make_element("thead", heads) if part.heads else None
         rows = [
-            element("tr", *(element("td", cell) for cell in row)) for row in part.rows
+            make_element("tr", *(make_element("td", cell) for cell in row))
+            for row in part.rows
         ]
-        children.append(element("table", head, element("tbody", *rows)))
+        children.append(make_element("table", head, make_element("tbody", *rows)))
     if part.folded:
-        return element("details", element("summary", part.title), *children)
-    title = element("p", element("b", part.title)) if part.title else None
-    return element("div", title, *children)
+        return make_element("details", make_element("summary", part.title), *children)
+    title = make_element("p", make_element("b", part.title)) if part.title else None
+    return make_element("div", title, *children)
 
 
-def result_figure(view: ShownResult) -> Figures:
+def render_result_figure(view: ShownResult) -> Figures:
     """Return the files of the first chart of a result; none if it has no chart."""
     for part in view.sections:
         if part.draw is not None:
-            return figure_of(part.draw, part.size or (WIDTH, part.height / PIXELS))
+            return render_axes(
+                part.draw, part.size or (FIGURE_WIDTH, part.height / PIXELS_PER_INCH)
+            )
     return {}
 
 
-def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
+def join_images(pictures: Sequence[ArrayLike]) -> bytes:
     images = [np.asarray(picture, dtype=np.float32) for picture in pictures]
     gap = np.ones((len(images[0]), GAP, 3), np.float32)
-    return png_bytes(
+    return encode_png(
         np.concatenate(
             [block for array in images for block in (array, gap)][:-1], axis=1
         )
     )
 
 
-def _picture(png: bytes, width: int, alt: str) -> Html:
-    return element(
+def _make_image(png: bytes, width: int, alt: str) -> Html:
+    return make_element(
         "img",
         src=f"data:image/png;base64,{base64.b64encode(png).decode()}",
         width=width,
@@ -622,9 +651,9 @@ def _picture(png: bytes, width: int, alt: str) -> Html:
     )
 
 
-HEIGHT = 300
-WIDE = 720
-NARROW = 350
+CHART_HEIGHT = 300
+WIDE_WIDTH = 720
+NARROW_WIDTH = 350
 """Height and widths of a chart in CSS pixels: for a screen, and for a phone, which
 would shrink the letters of the wide one until nobody can read them. The style sheet
 shows one of them.
@@ -637,7 +666,7 @@ COLORS = {
 }
 """Variables of the style sheet, and what stands for them while matplotlib draws."""
 # The same of the colours that figures have
-OF_FIGURES = {"search": BLUE, "baseline": RED, "soft": GREY}
+FIGURE_COLORS = {"search": BLUE, "baseline": RED, "soft": GREY}
 STYLE: dict[Any, Any] = {
     "font.size": 13.0,
     "path.simplify": False,
@@ -662,8 +691,11 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def study_chart(
-    draw: Callable[[Axes], object], words: str, width: int = WIDE, height: int = HEIGHT
+def make_chart_svg(
+    draw: Callable[[Axes], object],
+    description: str,
+    width: int = WIDE_WIDTH,
+    height: int = CHART_HEIGHT,
 ) -> Html:
     """Return what `draw` draws on axes, without its title and with the page's legend.
     The words say what it shows to who does not see it; width and height are in CSS
@@ -676,24 +708,26 @@ def study_chart(
         axes.set_title("")
         for legend in (*figure.legends, *filter(None, [axes.get_legend()])):
             legend.remove()
-        columns = 1 if width == NARROW else 2
+        columns = 1 if width == NARROW_WIDTH else 2
         figure.legend(
             loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"]
         )
 
-    (file,) = drawn(on_figure, (width / 72, height / 72), ("svg",), STYLE).values()
-    return element(
+    (file,) = render_figure(
+        on_figure, (width / 72, height / 72), ("svg",), STYLE
+    ).values()
+    return make_element(
         "svg",
-        element("title", words),
-        _inline(file.decode("utf-8"), f"{width}-"),
+        make_element("title", description),
+        _make_inline_svg(file.decode("utf-8"), f"{width}-"),
         viewBox=f"0 0 {width} {height}",
-        class_="chart wide" if width == WIDE else "chart narrow",
+        class_="chart wide" if width == WIDE_WIDTH else "chart narrow",
         role="img",
-        aria_label=words,
+        aria_label=description,
     )
 
 
-def _inline(svg: str, prefix: str) -> Html:
+def _make_inline_svg(svg: str, prefix: str) -> Html:
     """Return what a file in SVG draws: without its head, hundredths of a pixel, names
     and frames to cut at.
 
@@ -714,6 +748,6 @@ def _inline(svg: str, prefix: str) -> Html:
     )
     shapes = re.sub(r'href="#', f'href="#{prefix}', shapes)
     shapes = re.sub(r"<defs>\s*</defs>", "", shapes)
-    for name, color in (*COLORS.items(), *OF_FIGURES.items()):
+    for name, color in (*COLORS.items(), *FIGURE_COLORS.items()):
         shapes = shapes.replace(color, f"var(--{name})")
     return Html(shapes)

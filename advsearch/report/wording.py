@@ -77,9 +77,13 @@ _UNITS = {
     "those of the tasks": ("each",),
 }
 
-MOST_DECIMALS = 4  # Of a percentage
+MAX_DECIMALS = 4  # Of a percentage
 PROBABILITY_DECIMALS = 1  # Of a probability that a model gives
-WHOLE = ("background", "itself", "something else")  # Labels without an article
+LABELS_WITHOUT_ARTICLE = (
+    "background",
+    "itself",
+    "something else",
+)  # Labels without an article
 _OUTCOMES = {
     Outcome.MISSED: "missed",
     Outcome.LOOSE: "loose",
@@ -99,26 +103,30 @@ _DOING |= {"predicts": "predicting", "commands": "commanding"}
 
 
 # A prediction of a model: `advsearch.tasks.Prediction`, or what a result holds of one
-Said = Any
+AnyPrediction = Any
 
 
-def percent(share: float | None, most: int = MOST_DECIMALS) -> str:
+def percent(fraction: float | None, max_decimals: int = MAX_DECIMALS) -> str:
     """Return ``83 %`` for 0.83. 100 and 0 are said only of exactly 1 and 0."""
-    return "unknown" if share is None else f"{percent_number(float(share), most)} %"
+    return (
+        "unknown"
+        if fraction is None
+        else f"{format_percent_number(float(fraction), max_decimals)} %"
+    )
 
 
-def percent_number(share: float, most: int = MOST_DECIMALS) -> str:
+def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> str:
     """Return ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211 and ``99.98``
     for 0.99979.
 
-    Within five of 0 or 100 it has one decimal, and nearer to them as many, `most` at
-    most, as show how far it is away.
+    Within five of 0 or 100 it has one decimal, and nearer to them as many, `max_decimals` at
+    max_decimals, as show how far it is away.
     """
-    value = 100.0 * share
+    value = 100.0 * fraction
     distance = min(value, 100.0 - value)
     if distance >= 5.0 or distance <= 0.0:
         return f"{value:.0f}"
-    decimals = min(max(1, -math.floor(math.log10(distance))), most)
+    decimals = min(max(1, -math.floor(math.log10(distance))), max_decimals)
     text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
     if text not in ("0", "100"):
         return text
@@ -130,7 +138,7 @@ def percent_number(share: float, most: int = MOST_DECIMALS) -> str:
     )
 
 
-def share_of_text(
+def format_fraction_of(
     count: int, total: int, interval: tuple[float, float], share: float | None = None
 ) -> str:
     """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``;
@@ -138,7 +146,7 @@ def share_of_text(
     """
     if not total:
         return "none of 0"
-    low, high = map(percent_number, interval)
+    low, high = map(format_percent_number, interval)
     return (
         f"{percent(count / total if share is None else share)} ({low} to {high}) "
         "of "
@@ -146,7 +154,7 @@ def share_of_text(
     )
 
 
-def repeats_remark(name: str, repeats: int, units: int) -> str:
+def explain_repeats(name: str, repeats: int, units: int) -> str:
     """Return what is said of a sweep in which nothing is drawn, with so many `repeats`
     of each of its units, which are called by a `name`.
     """
@@ -164,19 +172,19 @@ def repeats_remark(name: str, repeats: int, units: int) -> str:
     )
 
 
-def with_article(name: str) -> str:
+def add_article(name: str) -> str:
     """Return ``a mug``, ``an iron``."""
     return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
 
 
-def beside_text(run: str, pair: Any) -> str:
+def format_paired_rates(run: str, pair: Any) -> str:
     """Return how often a model is right without and with the adversarial scene of a run
     (`PairedRates`), in sentences.
     """
     clean, adversarial = (
         f"{arm.correct} of {arm.configurations} ({percent(arm.accuracy)}, 95 % "
         "interval "
-        f"{interval_text(arm.interval)})"
+        f"{format_interval(arm.interval)})"
         for arm in (pair.clean, pair.answer)
     )
     lower, upper = (100.0 * bound for bound in pair.interval)
@@ -199,20 +207,20 @@ def beside_text(run: str, pair: Any) -> str:
     )
 
 
-def margin_text(task: str) -> str:
+def get_margin_meaning(task: str) -> str:
     return _MARGINS.get(task, "below 0 where the prediction is wrong")
 
 
-def objective_label(objective: str) -> str:
+def format_objective(objective: str) -> str:
     """Return an objective with its unit, for an axis: ``margin loss [logits]``."""
-    named = objective_name(objective)
+    named = get_objective_name(objective)
     return next(
         (f"{named} [{unit}]" for unit, names in _UNITS.items() if objective in names),
         named,
     )
 
 
-def objective_name(objective: str) -> str:
+def get_objective_name(objective: str) -> str:
     """Return what an objective is called beside its value: that of a margin has the
     margin's sign turned.
     """
@@ -221,20 +229,20 @@ def objective_name(objective: str) -> str:
     )
 
 
-def marks_text(task: str) -> str:
+def get_marks_legend(task: str) -> str:
     return _MARKS.get(
         task, "Blue is true of the scene, orange is the model's prediction."
     )
 
 
-def wanted(objective: str, thing: str) -> str:
+def format_goal(objective: str, thing: str) -> str:
     """Return what a search with an objective looks for, as a clause: "makes the model
     miss this mug".
     """
     return _WANTED.get(objective, "makes the model miss {}").format(thing)
 
 
-def prediction_cells(task: str, prediction: Said) -> list[str]:
+def format_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
     """Return a prediction and its number, for a table.
 
     For instance ``["vase", "84 %"]`` and ``["no cup found", "best score of cup
@@ -282,11 +290,11 @@ def _detection_cells(label: str, score: float, payload: Any) -> list[str]:
     return [label, f"score {score:.2f}"]
 
 
-def prediction_text(task: str, prediction: Said) -> str:
+def format_prediction(task: str, prediction: AnyPrediction) -> str:
     """Return a prediction on one line: ``vase, 91 %``, ``no cup found (best score of
     cup 0.12)``.
     """
-    label, number = prediction_cells(task, prediction)
+    label, number = format_prediction_cells(task, prediction)
     if not number:
         return label
     if task == DETECTION:
@@ -302,10 +310,14 @@ def prediction_text(task: str, prediction: Said) -> str:
     return f"{accuracy}, most often {label}"
 
 
-SEEN = ("seen", "box", "distance")  # Heads of `things_rows`, behind the name
+VISIBLE_HEADS = (
+    "seen",
+    "box",
+    "distance",
+)  # Heads of `format_thing_rows`, behind the name
 
 
-def things_rows(things: Mapping[str, Any]) -> list[list[str]]:
+def format_thing_rows(things: Mapping[str, Any]) -> list[list[str]]:
     """Return what is visible of each thing, for a table, from its name to
     `runs.results.ThingSeen` as a mapping.
     """
@@ -323,7 +335,7 @@ def things_rows(things: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
-def seen_cells(task: str, prediction: Said) -> list[str]:
+def format_image_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
     """Return one of the predictions of a whole picture, for a table: ``["cup", "score
     0.77"]``, ``["mug", "91 %"]``.
     """
@@ -338,9 +350,9 @@ def seen_cells(task: str, prediction: Said) -> list[str]:
     ]
 
 
-def seen_text(task: str, prediction: Said) -> str:
+def format_image_prediction(task: str, prediction: AnyPrediction) -> str:
     """Return the same on one line: ``cup (score 0.77)``, ``mug 91 %``."""
-    label, number = seen_cells(task, prediction)
+    label, number = format_image_prediction_cells(task, prediction)
     return (
         f"{label} ({number})"
         if task == DETECTION and number
@@ -348,7 +360,9 @@ def seen_text(task: str, prediction: Said) -> str:
     )
 
 
-def calls(task: str, thing: str, label: str, outcome: Outcome | None = None) -> str:
+def format_mistake(
+    task: str, thing: str, label: str, outcome: Outcome | None = None
+) -> str:
     """Return what a model does to a thing, as a clause: ``calls this mug a vase``,
     ``finds no cup``; of a detector by what becomes of the thing.
     """
@@ -359,29 +373,31 @@ def calls(task: str, thing: str, label: str, outcome: Outcome | None = None) -> 
     if outcome is Outcome.LOOSE:
         return f"sees {thing}, but {'only in part' if task == SEGMENTATION else 'in a loose box'}"
     if outcome is Outcome.PHANTOM:
-        return f"sees {with_article(label)}, and none where {thing} is"
+        return f"sees {add_article(label)}, and none where {thing} is"
     if task == CLASSIFICATION:
-        return f"calls {thing} {with_article(label)}"
+        return f"calls {thing} {add_article(label)}"
     if task == COMMAND:
-        return f"commands {with_article(label)}"
+        return f"commands {add_article(label)}"
     if task == DEPTH:
         return f"judges {thing} {label}"
     if task in (DETECTION, SEGMENTATION, SIMILARITY):
-        if label in WHOLE and task != DETECTION:
+        if label in LABELS_WITHOUT_ARTICLE and task != DETECTION:
             return f"takes {thing} for {label}"
-        return f"takes {thing} for {with_article(label)}"
+        return f"takes {thing} for {add_article(label)}"
     return f'predicts "{label}" for {thing}'
 
 
-def calling(task: str, label: str, outcome: Outcome | None = None) -> str:
+def format_mistake_participle(
+    task: str, label: str, outcome: Outcome | None = None
+) -> str:
     """Return the same of a thing that was named already: ``calling it a vase``,
     ``finding no cup``.
     """
-    verb, _, rest = calls(task, "it", label, outcome).partition(" ")
+    verb, _, rest = format_mistake(task, "it", label, outcome).partition(" ")
     return f"{_DOING[verb]} {rest.removesuffix(' for it')}"
 
 
-def outcomes_text(outcomes: Mapping[str, int] | None, task: str = "") -> str:
+def format_outcomes(outcomes: Mapping[str, int] | None, task: str = "") -> str:
     """Return how often each outcome came about that is not right: ``12 missed, 6 in a
     loose box``; empty where nothing is known of them.
     """
@@ -407,19 +423,19 @@ def get_only_outcome(outcomes: Mapping[str, int] | None) -> Outcome | None:
 NO_INTERVAL = "no interval"
 
 
-def short_name(value: Any) -> str:
+def shorten_name(value: Any) -> str:
     """Return the last part of a path, and a name as it is."""
     return PurePath(str(value)).name or str(value)
 
 
-def value_text(value: Any) -> str:
+def format_parameter_value(value: Any) -> str:
     """Return a value of a parameter, or the ends of a part of its range."""
     if isinstance(value, (list, tuple)):
-        return " to ".join(map(value_text, value))
-    return f"{value:.4g}" if isinstance(value, float) else short_name(value)
+        return " to ".join(map(format_parameter_value, value))
+    return f"{value:.4g}" if isinstance(value, float) else shorten_name(value)
 
 
-def figure_value(value: float | str) -> str:
+def format_figure_value(value: float | str) -> str:
     """Return a value as figures write it; of a file, its name without folder and
     suffix.
     """
@@ -428,23 +444,23 @@ def figure_value(value: float | str) -> str:
     return f"{value:.4g}"
 
 
-def short_names(text: str) -> str:
+def shorten_names(text: str) -> str:
     """Return the last parts of paths, of one or of several separated by commas:
     ``a.hdr, studio``.
     """
-    return ", ".join(map(short_name, split_names(text)))
+    return ", ".join(map(shorten_name, split_names(text)))
 
 
-def interval_text(interval: Interval | None) -> str:
+def format_interval(interval: Interval | None) -> str:
     """Return ``83-100 %`` for the interval of a rate."""
     return (
-        f"{percent_number(interval[0])}-{percent_number(interval[1])} %"
+        f"{format_percent_number(interval[0])}-{format_percent_number(interval[1])} %"
         if interval
         else NO_INTERVAL
     )
 
 
-def rate_text(rated: VerifiedRate) -> str:
+def format_rate(rated: VerifiedRate) -> str:
     """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``; and how many outputs
     are not numbers.
     """
@@ -457,29 +473,29 @@ def rate_text(rated: VerifiedRate) -> str:
         return f"none of {rated.trials} fresh renders: {nan_text}"
     rate = (
         f"{rated.successes} of {rated.trials} fresh renders (95 % interval "
-        f"{interval_text(rated.interval)})"
+        f"{format_interval(rated.interval)})"
     )
     return f"{rate}, and {nan_text}" if nan_text else rate
 
 
-def rated_cells(rated: VerifiedRate | ControlGroup) -> list[str]:
+def format_rate_cells(rated: VerifiedRate | ControlGroup) -> list[str]:
     """Return a rate and its interval, for a table: ``["20/20", "83-100 %"]``; of
     outputs that are not numbers, how many.
     """
     number = rated.successes if hasattr(rated, "successes") else rated.correct
     nan_text = f", {rated.not_a_number} not a number" if rated.not_a_number else ""
-    return [f"{number}/{rated.trials}{nan_text}", interval_text(rated.interval)]
+    return [f"{number}/{rated.trials}{nan_text}", format_interval(rated.interval)]
 
 
-def tally(what: str, number: int, trials: int, not_a_number: int = 0) -> str:
+def format_tally(event: str, number: int, trials: int, not_a_number: int = 0) -> str:
     """Return ``wrong in 20 of 20``; of outputs that are not numbers, how many."""
     nan_text = f"not a number in {not_a_number} of {trials}"
     if not not_a_number:
-        return f"{what} in {number} of {trials}"
-    return f"{what} in {number}, {nan_text}" if number else nan_text
+        return f"{event} in {number} of {trials}"
+    return f"{event} in {number}, {nan_text}" if number else nan_text
 
 
-def seconds_text(seconds: Any) -> str:
+def format_seconds(seconds: Any) -> str:
     """Return ``14.6 s``, ``3 min 5 s`` or ``2 h 10 min``."""
     if seconds is None:
         return "unknown"
@@ -491,12 +507,12 @@ def seconds_text(seconds: Any) -> str:
     return f"{total // 3600} h {total % 3600 // 60} min"
 
 
-def count(number: Any, thing: str) -> str:
+def format_count(number: Any, thing: str) -> str:
     """Return ``1 step``, ``40 steps``."""
     return f"{number or 0} {thing}{'' if number == 1 else 's'}"
 
 
-def workers_text(shared: SharedWork | None) -> str:
+def format_workers(shared: SharedWork | None) -> str:
     """Return how many workers shared the work, and where their time went; empty if
     nothing was shared.
     """
@@ -504,9 +520,9 @@ def workers_text(shared: SharedWork | None) -> str:
         return ""
     texts = [f"{shared.most} at most"]
     if shared.utilisation is not None:
-        alive = seconds_text(shared.alive)
+        alive = format_seconds(shared.alive)
         texts.append(f"busy {percent(shared.utilisation)} of {alive}")
-    texts.append(f"loading took {seconds_text(shared.loading)}")
+    texts.append(f"loading took {format_seconds(shared.loading)}")
     counts = {
         "lost": shared.lost,
         "refused": shared.refused,
@@ -516,7 +532,7 @@ def workers_text(shared: SharedWork | None) -> str:
     return ", ".join(texts)
 
 
-def formation_text(
+def format_formation(
     formation: Formation, gains: Mapping[str, float] | None = None
 ) -> str:
     """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn),
@@ -528,33 +544,33 @@ def formation_text(
         denoised = f"denoised ({formation.denoiser})"
     description = (
         f"{height} x {width} pixels, {formation.filter} filter, {denoised}, "
-        f"exposure {number_text(formation.exposure)} stops, "
+        f"exposure {format_number(formation.exposure)} stops, "
         f"sampler {formation.sampler}"
     )
     if formation.gain is not None:
-        return f"{description}, gain {number_text(formation.gain)}"
+        return f"{description}, gain {format_number(formation.gain)}"
     gain_texts = []
     for scene, gain in (gains or {}).items():
-        scene_name = ", ".join(map(short_name, scene.split(", ")))
-        gain_texts.append(f"{scene_name} {number_text(gain)}")
+        scene_name = ", ".join(map(shorten_name, scene.split(", ")))
+        gain_texts.append(f"{scene_name} {format_number(gain)}")
     description += ", a gain for each scene"
     return f"{description}: {'; '.join(gain_texts)}" if gain_texts else description
 
 
-def number_text(value: Any) -> str:
+def format_number(value: Any) -> str:
     """Return a value as text; a number with the digits that mean something to a
     reader.
     """
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def conditions_text(conditions: Sequence[ConditionRow]) -> str:
+def format_conditions(conditions: Sequence[ConditionRow]) -> str:
     return " and ".join(condition.text for condition in conditions) or (
         "everything that was looked at"
     )
 
 
-def share_text(extent: Extent) -> str:
+def format_extent(extent: Extent) -> str:
     """Return ``12 of 20 (60 %, 95 % interval 36-81 %)``."""
     share = "none"
     if extent.total:
@@ -563,7 +579,7 @@ def share_text(extent: Extent) -> str:
         )
     return (
         f"{extent.count} of {extent.total} ({share}, 95 % interval "
-        f"{interval_text(extent.interval)})"
+        f"{format_interval(extent.interval)})"
     )
 
 

@@ -34,12 +34,12 @@ from advsearch.trust.writing import (
     PART,
     RunLock,
     check_no_links,
-    check_there,
+    check_not_moved,
     storage_errors,
     write_bytes,
     write_text,
 )
-from advsearch.trust.yaml_text import LARGEST
+from advsearch.trust.yaml_text import MAX_YAML_BYTES
 
 if TYPE_CHECKING:
     from advsearch.runs.results import Result
@@ -61,9 +61,9 @@ AOV_FOLDER = "aov"  # of a sweep: the ground truth of each picture, by its numbe
 PARTS = "parts"  # runs that a study consists of
 
 # the note of parts that no file and no command can name: pairs of role and name
-ONLY_HERE = "only in Python"
-BEGUN_WITH = "settings"  # the note of settings that decide the run's numbers
-LONGEST_VALUE = 40  # characters of a value that an error states
+PYTHON_ONLY_NOTE = "only in Python"
+SETTINGS_NOTE = "settings"  # the note of settings that decide the run's numbers
+MAX_VALUE_LENGTH = 40  # characters of a value that an error states
 
 CONTENTS = (
     CONFIG,
@@ -93,7 +93,7 @@ class RunDirectory:
     def __init__(self, path: Path, held: RunLock) -> None:
         self.path = path
         self._lock = held
-        self._began = True
+        self._is_new = True
         self._tracker: Tracker | None = None
         self.store = store.Store(path / store.NAME)
 
@@ -120,9 +120,9 @@ class RunDirectory:
         Raises:
             RunExistsError: there is something already.
         """
-        path = _numbered(default) if run is None else run_path(run)
+        path = _make_numbered_directory(default) if run is None else locate_run(run)
         # or the folder of the study that it is a part of would be made
-        check_there(path)
+        check_not_moved(path)
         check_free(path, overwrite=overwrite)
         with storage_errors(path):
             path.mkdir(parents=True, exist_ok=True)
@@ -153,7 +153,7 @@ class RunDirectory:
             raise
 
     @classmethod
-    def of(cls, config: Config, resumed: str | Path | None = None) -> RunDirectory:
+    def open(cls, config: Config, resumed: str | Path | None = None) -> RunDirectory:
         """Open the directory of the run that `config` describes: a new one, or the one
         to go on with, as for `find_run`.
         """
@@ -175,7 +175,7 @@ class RunDirectory:
             location,
             config=config,
             overwrite=overwrite,
-            default=default_name(first, others),
+            default=make_default_name(first, others),
         )
 
     @classmethod
@@ -184,7 +184,7 @@ class RunDirectory:
         anything goes on; an InputError says if another process works on it, or it would
         give other numbers than the run began with.
         """
-        check_there(run_path(run))
+        check_not_moved(locate_run(run))
         path = find_run(run)
         check_links(path)
         with ExitStack() as undo:
@@ -192,36 +192,38 @@ class RunDirectory:
             undo.callback(lock.release)
             opened = cls(path, lock)
             undo.callback(opened.close)
-            opened._began = False
+            opened._is_new = False
             if config is not None:
-                opened._check_same(config)
+                opened._check_settings_unchanged(config)
             undo.pop_all()
         return opened
 
     @property
-    def again(self) -> str:
+    def restart_advice(self) -> str:
         """What a person can do instead of going on with it."""
-        if self.store.note(ONLY_HERE) is not None:
+        if self.store.read_note(PYTHON_ONLY_NOTE) is not None:
             return "start again where it was asked, in Python"
         return f"start again with advsearch run {self.path / CONFIG}"
 
     def _note_start(self, config: Config) -> None:
         """Note what decides the numbers of a new run."""
         if config.python_only_parts:
-            self.store.set_note(ONLY_HERE, json.dumps(config.python_only_parts))
+            self.store.write_note(
+                PYTHON_ONLY_NOTE, json.dumps(config.python_only_parts)
+            )
         self.check_unchanged(
-            summary.MADE_WITH, summary.made_with(_known_settings(config))
+            summary.VERSIONS_NOTE, summary.collect_versions(_known_settings(config))
         )
         # last: with it the others are there, too
-        self.check_unchanged(BEGUN_WITH, config.get_deciding_settings())
+        self.check_unchanged(SETTINGS_NOTE, config.get_deciding_settings())
 
-    def _check_same(self, config: Config) -> None:
+    def _check_settings_unchanged(self, config: Config) -> None:
         """Refuse settings, versions and files that decide other numbers than those that
         are stored.
         """
         # it was killed before anything was noted
-        if self.store.note(BEGUN_WITH) is None:
-            if self.store.count():
+        if self.store.read_note(SETTINGS_NOTE) is None:
+            if self.store.count_rows():
                 raise FileFormatError(
                     f"{self.store.path}: expected the settings the "
                     "run began with, got none"
@@ -233,8 +235,10 @@ class RunDirectory:
             for name, value in _known_settings(config).items()
             if name not in summary.NOT_READ_AGAIN
         }
-        self.check_unchanged(BEGUN_WITH, config.get_deciding_settings())
-        self.check_unchanged(summary.MADE_WITH, summary.made_with(read_again))
+        self.check_unchanged(SETTINGS_NOTE, config.get_deciding_settings())
+        self.check_unchanged(
+            summary.VERSIONS_NOTE, summary.collect_versions(read_again)
+        )
 
     def check_unchanged(self, note: str, facts: Mapping[str, Any]) -> None:
         """Store facts that decide the numbers of the run under a note.
@@ -243,7 +247,7 @@ class RunDirectory:
             InputError: a fact is not what it was when it was stored first; the run
                 can't go on.
         """
-        stored = self.store.noted(note)
+        stored = self.store.read_json_note(note)
         before = {} if stored is None else stored
         if not isinstance(before, dict):
             type_name = type(before).__name__
@@ -251,15 +255,17 @@ class RunDirectory:
                 f"{self.store.path}: expected what the run began with in the note "
                 f"{note!r}, got {type_name}"
             )
-        if changed := summary.changed_facts(before, facts):
-            changes = ", ".join(_with_value(name, before.get(name)) for name in changed)
+        if changed := summary.find_changed_facts(before, facts):
+            changes = ", ".join(
+                _format_change(name, before.get(name)) for name in changed
+            )
             raise InputError(
                 f"{self.path}: cannot resume with something else than the run began "
                 f"with: {changes}; restore it, or "
-                f"{self.again}"
+                f"{self.restart_advice}"
             )
         if not facts.keys() <= before.keys():
-            self.store.set_note(note, json.dumps({**facts, **before}))
+            self.store.write_note(note, json.dumps({**facts, **before}))
 
     def check_files_unchanged(self, used_settings: Iterable[Mapping[str, Any]]) -> None:
         """Store the versions, files and weights that settings name; errors as for
@@ -267,38 +273,42 @@ class RunDirectory:
         """
         facts = dict[str, str]()
         for values in used_settings:
-            facts |= summary.made_with(values)
-        self.check_unchanged(summary.MADE_WITH, facts)
+            facts |= summary.collect_versions(values)
+        self.check_unchanged(summary.VERSIONS_NOTE, facts)
 
-    def record(self, *rows: store.Row, told: store.Told | None = None) -> None:
+    def append_rows(
+        self, *rows: store.Row, cached: store.CachedEvaluation | None = None
+    ) -> None:
         """Add evaluated configurations to the results, and what the last of them told
         its search; they survive a kill when this returns (see `store`).
         """
-        self.store.append(rows, told)
+        self.store.append(rows, cached)
         if self._tracker is not None:
-            self._tracker.rows(rows)
+            self._tracker.send_rows(rows)
 
     @staticmethod
     def find_file_changed_since(run: Path, config: Config) -> str | None:
         """Return the name of a file that settings name and that is another one than
         when a run was made, or None.
         """
-        return summary.changed_file(RunDirectory.read_made_with(run), config.to_json())
+        return summary.find_changed_file(
+            RunDirectory.read_versions(run), config.to_json()
+        )
 
     @staticmethod
-    def read_made_with(run: Path) -> dict[str, object]:
+    def read_versions(run: Path) -> dict[str, object]:
         """Return the versions and the digests of files and weights that a run was made
         with, as it noted them.
         """
         with store.Store.open_to_read(run) as results:
-            noted = results.noted(summary.MADE_WITH)
+            noted = results.read_json_note(summary.VERSIONS_NOTE)
         return noted if isinstance(noted, dict) else {}
 
-    def record_row(self, kind: str, step: int, **columns: Any) -> None:
+    def append_row(self, kind: str, step: int, **columns: Any) -> None:
         """Add one evaluated configuration to the results; `columns` are those of
         `store.Row`.
         """
-        self.record(store.Row(kind, step, **columns))
+        self.append_rows(store.Row(kind, step, **columns))
 
     @staticmethod
     def locate_part(run: Path, name: str) -> Path:
@@ -322,7 +332,7 @@ class RunDirectory:
         return its path.
         """
         return write_bytes(
-            self.path / IMAGES / f"{name}.gif", files.animation_bytes(frames)
+            self.path / IMAGES / f"{name}.gif", files.encode_animation(frames)
         )
 
     def write_file(self, name: str, data: bytes) -> Path:
@@ -336,11 +346,11 @@ class RunDirectory:
 
     def close(self) -> None:
         """Close the results and give up the lock; a second call does nothing."""
-        self._told()
+        self._close_tracker()
         self.store.close()
         self._lock.release()
 
-    def _told(self) -> None:
+    def _close_tracker(self) -> None:
         if self._tracker is not None:
             self._tracker.close()
             self._tracker = None
@@ -351,13 +361,17 @@ class RunDirectory:
         was paid for.
         """
         has_files = any((self.path / name).exists() for name in (summary.NAME, PARTS))
-        return not has_files and self.store.count() == 0 and not self.store.has_answers
+        return (
+            not has_files
+            and self.store.count_rows() == 0
+            and not self.store.has_answers
+        )
 
     def discard(self) -> None:
         """Remove what this run wrote, and the directory if that leaves it empty."""
-        self._told()
+        self._close_tracker()
         with suppress(OSError, StorageError):
-            check_there(self.path)  # else it is another's by now
+            check_not_moved(self.path)  # else it is another's by now
             self.store.close()
             _clear(self.path)
             _remove_if_bare(self.path)
@@ -374,18 +388,18 @@ class RunDirectory:
     ) -> None:
         if error is None:
             try:
-                check_there(self.path)
+                check_not_moved(self.path)
             finally:
                 self.close()
             return
-        if self._began and self.is_empty:
+        if self._is_new and self.is_empty:
             self.discard()
         else:
             self.close()
 
 
 @contextmanager
-def begun(config: Config) -> Iterator[Path | None]:
+def create_before_work(config: Config) -> Iterator[Path | None]:
     """Make the folder of a new run before anything else is done, so that whatever ends
     the block can be gone on with.
 
@@ -394,10 +408,10 @@ def begun(config: Config) -> Iterator[Path | None]:
     that takes the place of another one, which stays until then.
     """
     location, overwrite = config.run_location
-    if overwrite and location is not None and is_run(run_path(location)):
+    if overwrite and location is not None and is_run(locate_run(location)):
         yield None
         return
-    home = HOME if location is None else run_path(location).parent
+    home = HOME if location is None else locate_run(location).parent
     missing_folders = [
         parent for parent in (home, *home.parents) if not os.path.exists(parent)
     ]
@@ -415,7 +429,7 @@ def begun(config: Config) -> Iterator[Path | None]:
         raise
 
 
-def default_name(object_name: str, controls: Iterable[str]) -> str:
+def make_default_name(object_name: str, controls: Iterable[str]) -> str:
     """Return ``mug-texture`` for the object ``mug`` or ``data/mug.obj`` and the control
     ``texture``: a safe name.
     """
@@ -433,14 +447,14 @@ def check_links(run: Path) -> None:
     check_no_links(run, CONTENTS, SMALL_PICTURES)
 
 
-def run_path(run: str | Path) -> Path:
+def locate_run(run: str | Path) -> Path:
     """Return where `run` is kept: a bare name in ``runs/``, a path as it is."""
     path = Path(run)
     is_name = isinstance(run, str) and os.sep not in run and run not in (".", "..")
     return HOME / path if is_name else path.expanduser()
 
 
-def typed_name(path: str | Path) -> str:
+def format_run_name(path: str | Path) -> str:
     """Return what a user types to name the run in a folder: its name in `HOME`, or its
     path.
     """
@@ -454,7 +468,7 @@ def find_run(run: str | Path, *, checked: bool = True) -> Path:
     unless it is not `checked`, as it must be before anything in it is read,
     FileFormatError where it has links in it (`check_links`).
     """
-    for path in (Path(run).expanduser(), run_path(run)):
+    for path in (Path(run).expanduser(), locate_run(run)):
         folder = path.parent if path.name in CONTENTS and os.path.isfile(path) else path
         if is_run(folder):
             if checked:
@@ -473,7 +487,7 @@ def read_python_only(path: Path) -> list[PythonOnly]:
     if not (path / store.NAME).is_file():
         return []
     with store.Store(path / store.NAME, read_only=True) as results:
-        noted = results.noted(ONLY_HERE)
+        noted = results.read_json_note(PYTHON_ONLY_NOTE)
     pairs = noted if isinstance(noted, list) else []
     return [
         PythonOnly(str(pair[0]), str(pair[1]))
@@ -491,7 +505,7 @@ def is_run(path: Path) -> bool:
     if os.path.islink(path / CONFIG):
         return False
     try:
-        with open_regular(path / CONFIG, "a run.yaml", LARGEST) as file:
+        with open_regular(path / CONFIG, "a run.yaml", MAX_YAML_BYTES) as file:
             return file.read(len(HEADER)) == HEADER.encode()
     except (OSError, FileFormatError):
         return False
@@ -501,7 +515,7 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
     """Check that a run may be put at `run`, or raise RunExistsError; call it before any
     long work.
     """
-    path = run_path(run)
+    path = locate_run(run)
     if "\0" in str(path):
         raise InputError(
             f"expected a name or a folder for the run, got {str(path)!r} "
@@ -530,7 +544,7 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
         )
 
 
-def _numbered(default: str) -> Path:
+def _make_numbered_directory(default: str) -> Path:
     pattern = re.compile(re.escape(default) + r"-(\d{3,})")
     with storage_errors(HOME):
         HOME.mkdir(parents=True, exist_ok=True)
@@ -564,11 +578,13 @@ def _known_settings(config: Config) -> dict[str, Any]:
     return {name: value for name, value in config.to_json().items() if name in known}
 
 
-def _with_value(name: str, value: object) -> str:
+def _format_change(name: str, value: object) -> str:
     """Return a name with the value that it had, where that is short."""
     text = format_value(value)
     return (
-        name if value is None or len(text) > LONGEST_VALUE else f"{name} (was {text})"
+        name
+        if value is None or len(text) > MAX_VALUE_LENGTH
+        else f"{name} (was {text})"
     )
 
 

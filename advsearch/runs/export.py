@@ -22,11 +22,11 @@ from advsearch.files import JsonObject, JsonValue
 from advsearch.options import Value
 from advsearch.runs.store import Row, Store
 from advsearch.trust.stored_files import open_regular, parse_json, read_text
-from advsearch.trust.writing import placed_by, replacing
+from advsearch.trust.writing import name_setting_in_errors, replace_file
 
 FORMATS = ("csv", "json", "parquet")
 PAYLOAD = "payload"
-OWN = (
+LEADING_COLUMNS = (
     *(
         "id",
         "kind",
@@ -43,8 +43,10 @@ OWN = (
     *("label", "label_index", "probability", PAYLOAD),
 )
 # columns of the store before and after the values
-AFTER = ("renders", "machine", "seconds", "time")
-GROUP = 8192  # rows of a Parquet row group, and so what is held in memory at once
+TRAILING_COLUMNS = ("renders", "machine", "seconds", "time")
+ROWS_PER_GROUP = (
+    8192  # rows of a Parquet row group, and so what is held in memory at once
+)
 
 
 def write_rows(
@@ -59,20 +61,24 @@ def write_rows(
     """
     if format not in FORMATS:
         raise UnknownNameError("format", format, FORMATS)
-    counts = store.counts()
+    counts = store.count_by_kind()
     if kind is not None and kind not in counts:
         raise UnknownNameError("kind of rows", kind, counts)
-    write = {"csv": _csv, "json": _json, "parquet": _parquet}[format]
-    names = as_columns(store.rows(kind))
+    write = {"csv": _write_csv, "json": _write_json, "parquet": _write_parquet}[format]
+    names = list_columns(store.rows(kind))
     if out is None:
-        write(map(as_record, store.rows(kind)), names, stream)
+        write(map(make_record, store.rows(kind)), names, stream)
     else:
-        with placed_by("out"), replacing(out) as part, part.open("wb") as file:
-            write(map(as_record, store.rows(kind)), names, file)
+        with (
+            name_setting_in_errors("out"),
+            replace_file(out) as part,
+            part.open("wb") as file,
+        ):
+            write(map(make_record, store.rows(kind)), names, file)
     return counts[kind] if kind is not None else sum(counts.values())
 
 
-def as_columns(rows: Iterable[Row]) -> list[str]:
+def list_columns(rows: Iterable[Row]) -> list[str]:
     """Return the columns of a table of these rows; metrics and values in the order in
     which they first occur.
     """
@@ -80,20 +86,20 @@ def as_columns(rows: Iterable[Row]) -> list[str]:
     values = dict[str, None]()
     for row in rows:
         metrics |= dict.fromkeys(row.metrics)
-        values |= dict.fromkeys(_values(row.values))
-    return [*OWN, *metrics, *values, *AFTER]
+        values |= dict.fromkeys(_flatten_values(row.values))
+    return [*LEADING_COLUMNS, *metrics, *values, *TRAILING_COLUMNS]
 
 
-def as_record(row: Row) -> JsonObject:
+def make_record(row: Row) -> JsonObject:
     columns = {
         field.name: getattr(row, field.name)
         for field in fields(row)
         if field.name not in ("values", "metrics")
     }
-    return columns | dict(row.metrics) | _values(row.values)
+    return columns | dict(row.metrics) | _flatten_values(row.values)
 
 
-def each_value(
+def iterate_values(
     values: Mapping[str, Value | JsonValue],
 ) -> Iterator[tuple[str, JsonValue, str]]:
     """Yield values by name with their units; of several numbers each, as
@@ -115,18 +121,20 @@ def each_value(
             yield name, value, unit
 
 
-def _values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
+def _flatten_values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
     return {
         f"{name} [{unit}]" if unit else name: value
-        for name, value, unit in each_value(values)
+        for name, value, unit in iterate_values(values)
     }
 
 
-def _csv(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:
+def _write_csv(
+    records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
+) -> None:
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
-    for record in map(_flat, records):
+    for record in map(_encode_payload, records):
         writer.writerow(
             {
                 name: int(value) if isinstance(value, bool) else value
@@ -136,7 +144,7 @@ def _csv(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> 
     text.detach()
 
 
-def _flat(record: JsonObject) -> JsonObject:
+def _encode_payload(record: JsonObject) -> JsonObject:
     payload = record[PAYLOAD]
     return (
         record
@@ -148,7 +156,9 @@ def _flat(record: JsonObject) -> JsonObject:
     )
 
 
-def _json(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:
+def _write_json(
+    records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
+) -> None:
     stream.write(b"[")
     for number, record in enumerate(records):
         line = json.dumps(
@@ -160,10 +170,10 @@ def _json(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) ->
     stream.write(b"\n]\n")
 
 
-def _parquet(
+def _write_parquet(
     records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
 ) -> None:
-    """Write records as Parquet, of which `GROUP` are in memory at once."""
+    """Write records as Parquet, of which `ROWS_PER_GROUP` are in memory at once."""
     try:
         # comes with the extra `parquet`
         import pyarrow.parquet
@@ -171,8 +181,8 @@ def _parquet(
         raise InputError(
             "format parquet: needs pyarrow; pip install pyarrow, or choose csv or json"
         ) from None
-    rows = map(_flat, records)
-    group = list(itertools.islice(rows, GROUP))
+    rows = map(_encode_payload, records)
+    group = list(itertools.islice(rows, ROWS_PER_GROUP))
     schema = _make_schema(names, group)
     with pyarrow.parquet.ParquetWriter(stream, schema) as writer:
         while group:
@@ -181,7 +191,7 @@ def _parquet(
                 values = [record.get(name) for record in group]
                 columns[name] = _convert_column(values, arrow_type)
             writer.write_table(pyarrow.table(columns, schema))
-            group = list(itertools.islice(rows, GROUP))
+            group = list(itertools.islice(rows, ROWS_PER_GROUP))
 
 
 def _make_schema(names: list[str], first_records: Sequence[JsonObject]) -> Any:
@@ -201,7 +211,7 @@ def _make_schema(names: list[str], first_records: Sequence[JsonObject]) -> Any:
     for field in fields(Row):
         python_type = str(field.type).partition(" ")[0]
         type_of_column[field.name] = arrow_types.get(python_type, arrow_types["str"])
-    for name in set(names) - {*OWN, *AFTER}:
+    for name in set(names) - {*LEADING_COLUMNS, *TRAILING_COLUMNS}:
         has_text = any(isinstance(record.get(name), str) for record in first_records)
         type_of_column[name] = arrow_types["str" if has_text else "float"]
     return pyarrow.schema([(name, type_of_column[name]) for name in names])
@@ -224,9 +234,9 @@ def _convert_column(values: list[Any], arrow_type: Any) -> list[Any]:
 DETAILS = "details.log"
 CLASSES = "class_maps.json"
 IMAGES = "images"
-LARGEST = 4 << 30
-LONGEST = 1 << 20  # most bytes of one of its lines
-MOST_CLASSES = 16 << 20  # most bytes of a `class_maps.json`
+MAX_LOG_BYTES = 4 << 30
+MAX_LINE_BYTES = 1 << 20  # most bytes of one of its lines
+MAX_CLASSES_BYTES = 16 << 20  # most bytes of a `class_maps.json`
 
 
 def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
@@ -236,7 +246,7 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
     """
     try:
         classes = parse_json(
-            read_text(folder / CLASSES, "the classes of 3DB", MOST_CLASSES)
+            read_text(folder / CLASSES, "the classes of 3DB", MAX_CLASSES_BYTES)
         )
         if not isinstance(classes, list):
             raise ValueError(type(classes).__name__)
@@ -247,23 +257,25 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
             f"{folder / CLASSES}: expected a list of names, got {error}"
         ) from None
     try:
-        file = open_regular(folder / DETAILS, "the log of 3DB", LARGEST)
+        file = open_regular(folder / DETAILS, "the log of 3DB", MAX_LOG_BYTES)
     except OSError as error:
         raise FileFormatError(
             f"{folder / DETAILS}: expected the log of 3DB, got {error.strerror}"
         ) from None
     with file:
         for number in range(1 << 62):
-            line = file.readline(LONGEST + 1)
+            line = file.readline(MAX_LINE_BYTES + 1)
             if not line:
                 return
-            if len(line) > LONGEST:
-                raise _wrong(folder, number, f"more than {LONGEST} bytes")
+            if len(line) > MAX_LINE_BYTES:
+                raise _make_line_error(
+                    folder, number, f"more than {MAX_LINE_BYTES} bytes"
+                )
             if line.strip():
-                yield _imported(folder, number, line, list(map(str, classes)))
+                yield _parse_line(folder, number, line, list(map(str, classes)))
 
 
-def _imported(
+def _parse_line(
     folder: Path, number: int, line: bytes, classes: Sequence[str]
 ) -> tuple[Row, Path | None]:
     """Return a line of 3DB's log as a row, and the file of its picture, if any.
@@ -274,10 +286,10 @@ def _imported(
     try:
         record = parse_json(line.decode())
     except ValueError as error:
-        raise _wrong(folder, number, str(error)) from None
+        raise _make_line_error(folder, number, str(error)) from None
     render_args = record.get("render_args") if isinstance(record, dict) else None
     if not isinstance(record, dict) or not isinstance(render_args, dict):
-        raise _wrong(folder, number, "a line without render_args")
+        raise _make_line_error(folder, number, "a line without render_args")
     label, label_index = _parse_prediction(record.get("prediction"), classes)
     loss = record.get("loss")
     row = Row(
@@ -295,15 +307,15 @@ def _imported(
 def _import_values(record: JsonObject, render_args: JsonObject) -> dict[str, Value]:
     """Return the parameters of a line of 3DB's log, those of lists by their index."""
     values: dict[str, Value] = {
-        "object": _value(record.get("model")),
-        "environment": _value(record.get("environment")),
+        "object": _make_value(record.get("model")),
+        "environment": _make_value(record.get("environment")),
     }
     for name, value in render_args.items():
         if isinstance(value, list):
             for index, component in enumerate(value):
-                values[f"{name}[{index}]"] = _value(component)
+                values[f"{name}[{index}]"] = _make_value(component)
         else:
-            values["model" if name == "network" else name] = _value(value)
+            values["model" if name == "network" else name] = _make_value(value)
     return values
 
 
@@ -335,11 +347,11 @@ def _is_number(value: JsonValue) -> TypeGuard[int | float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _value(value: JsonValue) -> Value:
+def _make_value(value: JsonValue) -> Value:
     return {"value": value if _is_number(value) else str(value), "unit": ""}
 
 
-def _wrong(folder: Path, number: int, got: str) -> FileFormatError:
+def _make_line_error(folder: Path, number: int, got: str) -> FileFormatError:
     return FileFormatError(
         f"{folder / DETAILS}: line {number + 1}: expected a line of "
         f"3DB's log, got {got[:120]}"

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from advsearch.errors import FileFormatError
-from advsearch.pictures import png_of
+from advsearch.pictures import encode_levels
 from advsearch.trust.databases import (
     LARGEST,
     check_before_writing,
@@ -26,7 +26,7 @@ from advsearch.trust.databases import (
     read_version,
 )
 from advsearch.trust.stored_files import open_regular
-from advsearch.trust.writing import replacing, storage_errors, write_bytes
+from advsearch.trust.writing import replace_file, storage_errors, write_bytes
 
 # in the header of every results.sqlite that is ours: "ADVS"
 APPLICATION_ID = 0x41445653
@@ -106,7 +106,7 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
     """
     check_before_writing(path)
     if not path.exists():
-        with replacing(path) as part, closing(sqlite3.connect(part)) as db:
+        with replace_file(path) as part, closing(sqlite3.connect(part)) as db:
             # there is nothing in it to lose yet, so the disk isn't waited for
             db.execute("PRAGMA synchronous = OFF")
             # before the log, so that the file itself has it
@@ -171,29 +171,31 @@ def to_8bit(image: Any) -> Bytes:
     becomes 0.
     """
     scaled: Floats = np.clip(
-        np.nan_to_num(_floats(image), nan=0.0), 0.0, 1.0
+        np.nan_to_num(_to_float32(image), nan=0.0), 0.0, 1.0
     ) * np.float32(255.0)
     return np.rint(scaled).astype(np.uint8)
 
 
-def difference(before: Any, after: Any, gain: float = DIFFERENCE_GAIN) -> Floats:
+def amplify_difference(
+    before: Any, after: Any, gain: float = DIFFERENCE_GAIN
+) -> Floats:
     """Return ``0.5 + gain (after - before)`` clipped to [0, 1]: mid grey where nothing
     changed.
     """
     moved: Floats = np.float32(0.5) + np.float32(gain) * (
-        _floats(after) - _floats(before)
+        _to_float32(after) - _to_float32(before)
     )
     return np.clip(moved, 0.0, 1.0)
 
 
-def png_bytes(image: Any) -> bytes:
+def encode_png(image: Any) -> bytes:
     """Return the display-referred picture as an 8-bit PNG; equal pictures give equal
     bytes.
     """
-    return png_of(_picture(to_8bit(image)))
+    return encode_levels(_check_image_shape(to_8bit(image)))
 
 
-def smaller_png(data: bytes, side: int) -> bytes:
+def shrink_png(data: bytes, side: int) -> bytes:
     """Return the picture of a PNG as a PNG whose longest side is at most `side`
     pixels.
     """
@@ -208,7 +210,7 @@ def write_png(path: Path, image: Any) -> Path:
     """Write the display-referred picture as an 8-bit PNG, whole or not at all, and
     return the path.
     """
-    return write_bytes(path, png_bytes(image))
+    return write_bytes(path, encode_png(image))
 
 
 def read_png(path: Path) -> Floats:
@@ -227,7 +229,7 @@ def write_exr(path: Path, image: Any) -> Path:
     """Write float32 values as an EXR (scan lines, ZIP), whole or not at all, and return
     the path.
     """
-    values = np.ascontiguousarray(_picture(_floats(image)))
+    values = np.ascontiguousarray(_check_image_shape(_to_float32(image)))
     return _write_exr(path, {"Y" if values.ndim == 2 else "RGB": values}, {})
 
 
@@ -259,7 +261,7 @@ def _write_exr(
         "type": OpenEXR.scanlineimage,
         **notes,
     }
-    with replacing(path) as part:
+    with replace_file(path) as part:
         try:
             with OpenEXR.File(header, dict(channels)) as file:
                 file.write(os.fspath(part))
@@ -269,7 +271,7 @@ def _write_exr(
     return path
 
 
-def animation_bytes(frames: Sequence[Any]) -> bytes:
+def encode_animation(frames: Sequence[Any]) -> bytes:
     """Return the display-referred pictures as a GIF that repeats, holds its last frame
     and is at most 3 MB.
     """
@@ -279,7 +281,8 @@ def animation_bytes(frames: Sequence[Any]) -> bytes:
         # the first and the last among them
         indices = np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)
         pictures = [
-            Image.fromarray(_picture(to_8bit(frames[index]))) for index in indices
+            Image.fromarray(_check_image_shape(to_8bit(frames[index])))
+            for index in indices
         ]
         block = max(shrink, -(-max(pictures[0].size) * shrink // ANIMATION_SIDE))
         width, height = (
@@ -288,7 +291,7 @@ def animation_bytes(frames: Sequence[Any]) -> bytes:
         pictures = [
             picture.reduce(block, (0, 0, width, height)) for picture in pictures
         ]
-        data = _gif(pictures)
+        data = _encode_gif(pictures)
         if len(data) <= ANIMATION_BYTES or min(pictures[0].size) < 16:
             return data
         if count > 10:
@@ -297,7 +300,7 @@ def animation_bytes(frames: Sequence[Any]) -> bytes:
             shrink *= 2
 
 
-def _gif(pictures: Sequence[Image.Image]) -> bytes:
+def _encode_gif(pictures: Sequence[Image.Image]) -> bytes:
     # one palette for all frames, by Pillow itself: 20 times as fast as through imageio
     pixels = np.concatenate([np.asarray(picture) for picture in pictures])
     stride = 1 + pixels.shape[0] * pixels.shape[1] // _PALETTE_PIXELS
@@ -322,7 +325,7 @@ def _gif(pictures: Sequence[Image.Image]) -> bytes:
     return buffer.getvalue()
 
 
-def _picture(array: Any) -> Any:
+def _check_image_shape(array: Any) -> Any:
     """Return (H, W, 3) or (H, W); one channel loses its axis."""
     squeezed = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
     if squeezed.ndim != 2 and not (squeezed.ndim == 3 and squeezed.shape[2] == 3):
@@ -332,7 +335,7 @@ def _picture(array: Any) -> Any:
     return squeezed
 
 
-def _floats(image: Any) -> Floats:
+def _to_float32(image: Any) -> Floats:
     return np.asarray(
         image.detach().cpu() if hasattr(image, "detach") else image, dtype=np.float32
     )

@@ -19,7 +19,7 @@ FAULT = "it cannot be read, which is a fault of advsearch"
 
 
 @dataclass(frozen=True)
-class Listed:
+class ListedRun:
     """One run in its folder: the command that made it, what the model should recognise,
     what could change, rows by kind; ``"running"`` where a process works on it,
     ``"stopped"`` where it can be resumed, else its ending; the result in a few words;
@@ -41,37 +41,37 @@ class Listed:
     fault: str = ""
 
 
-def listed_runs(folder: Path) -> list[Listed]:
+def list_runs(folder: Path) -> list[ListedRun]:
     """Return the runs in a folder, by name; what cannot be read is shown as far as it
     can.
     """
     if not folder.is_dir():
         return []
     return [
-        listed_run(path)
+        read_listed_run(path)
         for path in sorted(folder.iterdir())
         if path.is_dir() and is_run(path)
     ]
 
 
-def finished(path: Path) -> bool:
+def is_finished(path: Path) -> bool:
     """Whether a run has come to its end; one that was interrupted, or killed while its
     report was written, has not.
     """
-    if not (path / summary.NAME).is_file() or summary.read_result(path).goes_on:
+    if not (path / summary.NAME).is_file() or summary.read_result(path).is_unfinished:
         return False
     return not files.is_results_database(path / store.NAME) or not can_resume(path)
 
 
 def can_resume(path: Path) -> bool:
     with store.Store(path / store.NAME, read_only=True) as results:
-        return results.goes_on
+        return results.has_cached
 
 
-_LISTED: dict[tuple[str, bool], tuple[object, Listed]] = {}
+_LISTED: dict[tuple[str, bool], tuple[object, ListedRun]] = {}
 
 
-def listed_run(path: Path, *, counts: bool = True) -> Listed:
+def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
     """Return the run in a folder; what cannot be read is shown as far as it can, and
     `fault` says why. To count rows takes a second for a million. A run is read again
     where its files have changed, or a process works on it.
@@ -86,7 +86,7 @@ def listed_run(path: Path, *, counts: bool = True) -> Listed:
         faults: list[str] = []
         try:
             check_links(path)
-            listed = _as_far_as_read(path, counts, running, faults)
+            listed = _make_listed_run(path, counts, running, faults)
         except (
             Exception
         ) as error:  # whatever is wrong with one run, the others are listed
@@ -95,7 +95,7 @@ def listed_run(path: Path, *, counts: bool = True) -> Listed:
                 if isinstance(error, AdvsearchError)
                 else f"{FAULT}: {type(error).__name__}"
             )
-            listed = Listed(
+            listed = ListedRun(
                 path.name, str(path), "?", "?", (), 0, "damaged", "", {}, False, None
             )
         _LISTED[key] = state, replace(listed, fault=faults[0] if faults else "")
@@ -110,32 +110,32 @@ def _state(path: Path) -> object:
     return None
 
 
-def _as_far_as_read(
+def _make_listed_run(
     path: Path, counts: bool, running: bool, faults: list[str]
-) -> Listed:
+) -> ListedRun:
     config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
-    with _told(faults, path / CONFIG):
+    with _collect_faults(faults, path / CONFIG):
         config = read_yaml(path / CONFIG)
-    with _told(faults, path / summary.NAME):
+    with _collect_faults(faults, path / summary.NAME):
         result = summary.read_result(path)
     if counts:
         with (
-            _told(faults, path / store.NAME),
+            _collect_faults(faults, path / store.NAME),
             store.Store(path / store.NAME, read_only=True) as results,
         ):
-            kinds = results.counts()
+            kinds = results.count_by_kind()
     object_name = getattr(result, "object", None) or ",".join(
         getattr(result, "objects", ())
     )
     controls = getattr(result, "controls", ()) or config.get("controls") or ()
     ending = (
         "stopped"
-        if result is None or result.goes_on
+        if result is None or result.is_unfinished
         else str(getattr(result, "ending", "done"))
     )
-    return Listed(
+    return ListedRun(
         path.name,
         str(path),
         command=str(config.get("command") or (result.command if result else "?")),
@@ -160,7 +160,7 @@ def _as_far_as_read(
 
 
 @contextmanager
-def _told(faults: list[str], file: Path) -> Iterator[None]:
+def _collect_faults(faults: list[str], file: Path) -> Iterator[None]:
     """Note what is wrong with a file, but not that it is missing."""
     try:
         yield

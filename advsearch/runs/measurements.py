@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from advsearch.interrupts import interruptible
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME, Fields, Result
-from advsearch.runs.summary import NAME, stored_result
+from advsearch.runs.summary import NAME, read_stored_result
 
 Row = TypeVar("Row")
 AnyFields = TypeVar("AnyFields", bound=Fields)
@@ -31,7 +31,7 @@ class Measurements:
     before the first one.
 
     Attributes:
-        made: how many were made in this sitting.
+        n_new: how many were made in this sitting.
 
     Args:
         context: `experiment.RunContext` of the run that stores them.
@@ -42,17 +42,17 @@ class Measurements:
         self._context = context
         self._store = context.run.store
         self._end = math.inf if seconds is None else time.monotonic() + seconds
-        self.made = 0
+        self.n_new = 0
 
     def get(self, key: str, measure: Callable[[], Any]) -> Any:
         """Return the JSON value that is stored under a key, or what `measure` returns
         in time, and store it.
         """
-        stored = self.stored(key)
+        stored = self.read(key)
         if stored is None:
-            if self.made and time.monotonic() >= self._end:
+            if self.n_new and time.monotonic() >= self._end:
                 raise OutOfTime
-            self.made += 1
+            self.n_new += 1
             stored = json.loads(json.dumps(measure()))
             self.put(key, stored)
         return stored
@@ -82,7 +82,7 @@ class Measurements:
     def put(self, key: str, value: Any) -> None:
         self._store.set_note(key, json.dumps(value))
 
-    def stored(self, key: str) -> Any:
+    def read(self, key: str) -> Any:
         return self._store.noted(key)
 
     def collect(
@@ -102,7 +102,7 @@ class Measurements:
             with interruptible():
                 for row in rows:
                     collected_rows.append(row)
-                    if self.made:
+                    if self.n_new:
                         context.run.write_summary(make_result(collected_rows))
                 context.ending = "done"
         except KeyboardInterrupt:
@@ -112,9 +112,9 @@ class Measurements:
         result = make_result(collected_rows)
         if (
             context.ending == INTERRUPTED
-            and not self.made
+            and not self.n_new
             and (context.run.path / NAME).is_file()
         ):
-            earlier = stored_result(context.run.path)
+            earlier = read_stored_result(context.run.path)
             return earlier if isinstance(earlier, type(result)) else result
         return result

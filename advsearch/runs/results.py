@@ -38,7 +38,7 @@ OUT_OF_TIME = "out of time"
 # how a result stands that is read while a process works on its run; none is kept so
 RUNNING = "running"
 # fields that are written last, in this order
-END = ("warnings", "seconds", "seed", "command_line")
+LAST_FIELDS = ("warnings", "seconds", "seed", "command_line")
 
 JsonFloat = Annotated[
     float, BeforeValidator(lambda value: math.nan if value is None else value)
@@ -48,7 +48,7 @@ JsonFloat = Annotated[
 Interval = tuple[JsonFloat, JsonFloat]  # both ends of a 95 % interval
 
 
-def having(*names: str) -> AfterValidator:
+def key_validator(*names: str) -> AfterValidator:
 
     def check(values: Mapping[str, object]) -> Mapping[str, object]:
         missing = [name for name in names if name not in values]
@@ -72,7 +72,7 @@ def as_fact(form: str = "{}") -> dict[str, JsonValue]:
     return {"fact": form}
 
 
-def optional(description: str, **more: Any) -> Any:
+def optional_field(description: str, **more: Any) -> Any:
     """Return a field that is None, and then left out, by what it is; `more` as for
     `pydantic.Field`.
     """
@@ -105,7 +105,7 @@ class Fields(BaseModel):
 
     def to_dict(self) -> JsonObject:
         """Return the fields as JSON values; NaN and infinity are None."""
-        values: JsonObject = plain(
+        values: JsonObject = to_json_value(
             self.model_dump(exclude_defaults=True, by_alias=True)
         )
         return values
@@ -137,7 +137,7 @@ class Result(Fields):
         return found
 
     @property
-    def goes_on(self) -> bool:
+    def is_unfinished(self) -> bool:
         """Whether it has not come to its end: it is running, or was stopped and can be
         resumed.
         """
@@ -226,7 +226,7 @@ class RunResult(Result):
     environment: str
     controls: list[str]
     ending: str = Field(description="how it ended")
-    seconds: Annotated[dict[str, JsonFloat], having("total")] = Field(
+    seconds: Annotated[dict[str, JsonFloat], key_validator("total")] = Field(
         description="by part of the work, and in `total`"
     )
     seed: int = Field(description="the root seed")
@@ -246,19 +246,19 @@ class RunResult(Result):
     def to_dict(self) -> JsonObject:
         """Return the fields as JSON values, what a reader looks for first in front."""
         values = super().to_dict()
-        for name in END:
+        for name in LAST_FIELDS:
             if name in values:
                 values[name] = values.pop(name)
         return values
 
 
-Payload = Annotated[JsonValue, BeforeValidator(lambda value: plain(value))]
+Payload = Annotated[JsonValue, BeforeValidator(lambda value: to_json_value(value))]
 """What a task keeps of a prediction beside its words."""
 
 Outcomes = dict[str, int] | None
 """How often each of `options.Outcome` came about, by its value."""
 
-WHAT_BECOMES = "[what becomes of the object](tasks.md#what-becomes-of-the-object)"
+OUTCOME_TEXT = "[what becomes of the object](tasks.md#what-becomes-of-the-object)"
 ONLY_OF_BOXES = "absent but for detection and segmentation"
 
 
@@ -285,9 +285,11 @@ class VariedValue(Fields):
     """What a value was drawn from by chance."""
 
     unit: str
-    low: float | None = optional("the least; absent of names")
-    high: float | None = optional("the most; absent of names")
-    names: list[str] | None = optional("of which one was drawn; absent of numbers")
+    low: float | None = optional_field("the least; absent of names")
+    high: float | None = optional_field("the most; absent of names")
+    names: list[str] | None = optional_field(
+        "of which one was drawn; absent of numbers"
+    )
 
 
 class CleanScene(Fields):
@@ -310,13 +312,13 @@ class Formation(Fields):
     )
 
 
-def plain(value: Any) -> Any:
+def to_json_value(value: Any) -> Any:
     """Return `value` made of what JSON has: numbers of numpy and torch become Python's,
     NaN and infinity become None. Raises TypeError where something in it has no JSON
     form.
     """
     if isinstance(value, enum.Enum):
-        return plain(value.value)
+        return to_json_value(value.value)
     if value is None or isinstance(value, (str, bool, int)):
         return value
     if isinstance(value, float):
@@ -326,16 +328,16 @@ def plain(value: Any) -> Any:
     if isinstance(value, Fields):
         return value.to_dict()
     if isinstance(value, Mapping):
-        return {str(name): plain(inner) for name, inner in value.items()}
+        return {str(name): to_json_value(inner) for name, inner in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(inner) for inner in value]
+        return [to_json_value(inner) for inner in value]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {
-            field.name: plain(getattr(value, field.name))
+            field.name: to_json_value(getattr(value, field.name))
             for field in dataclasses.fields(value)
         }
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return to_json_value(value.tolist())
     raise TypeError(
         f"expected something that JSON can hold, got {type(value).__name__}"
     )
@@ -358,7 +360,9 @@ class CountedPredictions(Fields):
     interval: Interval | None = Field(
         description="of that share, 95 %; null where all are of one draw"
     )
-    outcomes: Outcomes = optional(f"{WHAT_BECOMES} in the other ones; {ONLY_OF_BOXES}")
+    outcomes: Outcomes = optional_field(
+        f"{OUTCOME_TEXT} in the other ones; {ONLY_OF_BOXES}"
+    )
 
 
 class ConditionRow(Fields):
@@ -373,7 +377,7 @@ class ConditionRow(Fields):
         description="values are no larger; null without that bound, and for names"
     )
     options: list[str] = Field(description="the names it is about; empty for numbers")
-    turn: float | None = optional(
+    turn: float | None = optional_field(
         "degrees after which values count as the same, 180 or 360; `over` may then be "
         "over `at_most`: the "
         "part goes through 0. Null for other parts"
@@ -512,18 +516,18 @@ class Measured(Fields):
     )
     seconds: float = Field(description="of one, median")
     status: GradientStatus = Field(description="whether it agrees with its reference")
-    error: JsonFloat | None = optional(
+    error: JsonFloat | None = optional_field(
         "of one, root mean square; an upper limit where the reference is unusable"
     )
-    interval: Interval | None = optional("of `error`")
-    bias: JsonFloat | None = optional("error of the mean")
-    doubt: JsonFloat | None = optional("how much of `bias` the noise explains")
-    noise: JsonFloat | None = optional("standard deviation of one")
-    cosine: JsonFloat | None = optional("of a gradient with its reference, mean")
-    value: JsonFloat | None = optional("of a derivative, mean")
-    reference: JsonFloat | None = optional("what `value` should be")
-    reference_error: JsonFloat | None = optional("the reference's own")
-    reference_cosine: JsonFloat | None = optional(
+    interval: Interval | None = optional_field("of `error`")
+    bias: JsonFloat | None = optional_field("error of the mean")
+    doubt: JsonFloat | None = optional_field("how much of `bias` the noise explains")
+    noise: JsonFloat | None = optional_field("standard deviation of one")
+    cosine: JsonFloat | None = optional_field("of a gradient with its reference, mean")
+    value: JsonFloat | None = optional_field("of a derivative, mean")
+    reference: JsonFloat | None = optional_field("what `value` should be")
+    reference_error: JsonFloat | None = optional_field("the reference's own")
+    reference_cosine: JsonFloat | None = optional_field(
         "smallest of two converged gradients, of which the reference is the mean"
     )
 
@@ -548,7 +552,7 @@ class ClassPrediction(Fields):
     probability: float | None = Field(description="null where the model gives none")
 
 
-class ThingSeen(Fields):
+class VisibleThing(Fields):
     """What a picture shows of the object, or of a thing beside it."""
 
     label: str | None = Field(description="what a model should call it")
@@ -578,7 +582,7 @@ class ViewPredictions(Fields):
         validation_alias=AliasChoices("answers", "predictions"),
         description="the likeliest first",
     )
-    things: dict[str, ThingSeen] | None = optional(
+    things: dict[str, VisibleThing] | None = optional_field(
         "what is seen of `object` and of each thing beside it; absent without any"
     )
 
@@ -596,7 +600,7 @@ class RenderResult(Result):
     command: ClassVar[str] = "render"
 
     out: str = Field(description="the file that was written")
-    answered: str | None = optional(
+    answered: str | None = optional_field(
         "that with boxes and masks drawn in; absent where the task draws none"
     )
     size: tuple[int, int] = Field(description="of the file, [height, width] in pixels")
@@ -628,8 +632,8 @@ class ControlGroup(Fields):
     not_a_number: int = Field(
         default=0, description="trials whose output is NaN or infinity; absent without"
     )
-    outcomes: Outcomes = optional(
-        f"{WHAT_BECOMES} in those that are not right; {ONLY_OF_BOXES}"
+    outcomes: Outcomes = optional_field(
+        f"{OUTCOME_TEXT} in those that are not right; {ONLY_OF_BOXES}"
     )
 
 
@@ -647,7 +651,9 @@ class VerifiedRate(Fields):
     labels: dict[str, int] = Field(
         description="predictions of the successes, and how often each was given"
     )
-    outcomes: Outcomes = optional(f"{WHAT_BECOMES} in the successes; {ONLY_OF_BOXES}")
+    outcomes: Outcomes = optional_field(
+        f"{OUTCOME_TEXT} in the successes; {ONLY_OF_BOXES}"
+    )
     margin: JsonFloat = Field(
         description="mean over these trials, below 0 in a success, in logits; of a "
         "detector in log-odds"
@@ -655,7 +661,7 @@ class VerifiedRate(Fields):
     not_a_number: int = Field(
         default=0, description="trials whose output is NaN or infinity; absent without"
     )
-    stopped: str | None = optional(
+    stopped: str | None = optional_field(
         "why there are no more: `asked for` (as many as were) or `decided` (the "
         "verdict stands); absent of "
         "trials that are no verdict"
@@ -703,19 +709,19 @@ class LinearTransport(Fields):
     """What predicted the pictures of the searches."""
 
     used: bool
-    way: str | None = optional(
+    way: str | None = optional_field(
         "by what: `matrix`, `basis pictures` (of a sweep), or `surface light`"
     )
-    reason: str | None = optional(
+    reason: str | None = optional_field(
         "why pictures were rendered, all or from some evaluation on, or not predicted "
         "by surface light"
     )
-    conditions: BankOfConditions | None = optional("with `over`")
-    entries: int | None = optional("of the matrix")
-    bytes: int | None = optional("of its memory")
-    seconds: float | None = optional("that it and the comparisons took")
-    renewed: int | None = optional("how often it was made again")
-    error: PredictionError | None = optional("of the last comparison")
+    conditions: BankOfConditions | None = optional_field("with `over`")
+    entries: int | None = optional_field("of the matrix")
+    bytes: int | None = optional_field("of its memory")
+    seconds: float | None = optional_field("that it and the comparisons took")
+    renewed: int | None = optional_field("how often it was made again")
+    error: PredictionError | None = optional_field("of the last comparison")
 
 
 class PrintTerms(Fields):

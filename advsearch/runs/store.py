@@ -21,10 +21,15 @@ from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
 from advsearch.options import NOT_A_NUMBER, OUT_OF_VIEW, Value
 from advsearch.runs.files import SCHEMA, check_version, connect_to_write
-from advsearch.runs.results import plain
-from advsearch.trust.databases import DAMAGED, check_schema, connect_to_read, readable
+from advsearch.runs.results import to_json_value
+from advsearch.trust.databases import (
+    DAMAGED,
+    check_schema,
+    connect_to_read,
+    translate_database_errors,
+)
 from advsearch.trust.stored_files import parse_json
-from advsearch.trust.writing import check_there, note_open, storage_errors
+from advsearch.trust.writing import check_not_moved, note_open, storage_errors
 
 NAME = "results.sqlite"
 # least seconds between two forced writes to the disk; what a power cut may cost
@@ -76,7 +81,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Told:
+class CachedEvaluation:
     """What an evaluation told its search beside its row: the digest of the
     configuration, how many numbers of the gradient were not finite, the cost in
     evaluations, and, where it is kept, a gradient (d,) float32 and a picture (H, W, 3)
@@ -92,7 +97,7 @@ class Told:
     picture: NDArray[np.uint8] | None = None
 
 
-_TOLD = "number, u, non_finite, cost, gradient, picture, height"
+_CACHED_COLUMNS = "number, u, non_finite, cost, gradient, picture, height"
 _AS_JSON = ("payload", "values", "metrics")
 _COLUMNS = tuple(
     f"{field.name}_json" if field.name in _AS_JSON else field.name
@@ -103,7 +108,7 @@ _INSERT = (
     f"({', '.join('?' * len(_COLUMNS))}) ON CONFLICT DO NOTHING"
 )
 
-_INSERT_TOLD = (
+_INSERT_CACHED = (
     "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations "
     "WHERE "
     "kind = ? AND step = ?"
@@ -123,7 +128,7 @@ class Store:
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path
         self._next_sync = -math.inf
-        with readable(path):
+        with translate_database_errors(path):
             self._db = connect_to_read(path) if read_only else connect_to_write(path)
             check_version(self._db, path)
             check_schema(self._db, path, SCHEMA)
@@ -141,12 +146,14 @@ class Store:
         """
         return cls(run / NAME, read_only=True)
 
-    def append(self, rows: Sequence[Row], told: Told | None = None) -> None:
+    def append(
+        self, rows: Sequence[Row], cached: CachedEvaluation | None = None
+    ) -> None:
         """Add rows in one transaction; they survive a kill of the process when this
         returns, and where the disk is full none of them is kept. A row whose kind and
-        step are there already changes nothing. What it `told` is that of the last one.
+        step are there already changes nothing. What it `cached` is that of the last one.
         """
-        check_there(self.path)
+        check_not_moved(self.path)
         start_time = time.monotonic()
         timestamp = time.time()
         must_sync = start_time >= self._next_sync
@@ -156,22 +163,22 @@ class Store:
             )
             with self._db:
                 self._db.executemany(_INSERT, (_encode(row, timestamp) for row in rows))
-                if told is not None:
+                if cached is not None:
                     arrays = [
                         None if array is None else array.tobytes()
-                        for array in (told.gradient, told.picture)
+                        for array in (cached.gradient, cached.picture)
                     ]
-                    height = None if told.picture is None else len(told.picture)
+                    height = None if cached.picture is None else len(cached.picture)
                     search_values = (
-                        told.number,
-                        told.u,
-                        told.non_finite,
-                        told.cost,
+                        cached.number,
+                        cached.u,
+                        cached.non_finite,
+                        cached.cost,
                         *arrays,
                         height,
                     )
                     self._db.execute(
-                        _INSERT_TOLD, (*search_values, rows[-1].kind, rows[-1].step)
+                        _INSERT_CACHED, (*search_values, rows[-1].kind, rows[-1].step)
                     )
         if must_sync:
             end_time = time.monotonic()
@@ -180,12 +187,12 @@ class Store:
             )
 
     def _select(self, query: str, *parameters: Any) -> Iterator[Any]:
-        with readable(self.path):
+        with translate_database_errors(self.path):
             cursor = self._db.execute(f"SELECT {query}", parameters)
             row = cursor.fetchone()
         while row is not None:
             yield row
-            with readable(self.path):
+            with translate_database_errors(self.path):
                 row = cursor.fetchone()
 
     def rows(self, kind: str | None = None, after: int = 0) -> Iterator[Row]:
@@ -203,7 +210,7 @@ class Store:
         ):
             yield _decode(values, self.path)
 
-    def row(self, kind: str, step: int) -> Row | None:
+    def read_row(self, kind: str, step: int) -> Row | None:
         """Return the last row of a kind with a step; None where there is none."""
         what = (
             f"{', '.join(_COLUMNS)} FROM evaluations WHERE kind = ? AND step = ? "
@@ -214,21 +221,25 @@ class Store:
             None,
         )
 
-    def told(self, kind: str, step: int) -> tuple[Row, Told] | None:
+    def read_cached(self, kind: str, step: int) -> tuple[Row, CachedEvaluation] | None:
         """Return a row of a search with what it told; None where there is none, or the
         run is done.
         """
-        row = self.row(kind, step)
+        row = self.read_row(kind, step)
         values = (
             None
             if row is None
-            else next(self._select(f"{_TOLD} FROM told WHERE row = ?", row.id), None)
+            else next(
+                self._select(f"{_CACHED_COLUMNS} FROM told WHERE row = ?", row.id), None
+            )
         )
         return (
-            None if row is None or values is None else (row, _told(values, self.path))
+            None
+            if row is None or values is None
+            else (row, _decode_cached(values, self.path))
         )
 
-    def pictures(
+    def iterate_images(
         self, kind: str, after: int, until: int
     ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield number and picture of what rows of a kind with ids over `after` have
@@ -240,25 +251,25 @@ class Store:
             "WHERE kind = ? AND id > ? AND id <= ? AND picture IS NOT NULL ORDER BY id"
         )
         for values in self._select(query, kind, after, until):
-            evaluation = _told(values, self.path)
+            evaluation = _decode_cached(values, self.path)
             assert evaluation.picture is not None
             yield evaluation.number, evaluation.picture
 
     @property
-    def goes_on(self) -> bool:
+    def has_cached(self) -> bool:
         """Whether there is something that searches were told: the run is not done."""
         return bool(next(self._select("EXISTS (SELECT * FROM told)"))[0])
 
-    def forget(self) -> None:
+    def delete_cached(self) -> None:
         """Remove what searches were told: the run is done."""
-        check_there(self.path)
+        check_not_moved(self.path)
         with storage_errors(self.path):
             with self._db:
                 n_deleted = self._db.execute("DELETE FROM told").rowcount
             if n_deleted:
                 self._db.execute("VACUUM")
 
-    def last_step(self, kind: str) -> int:
+    def get_last_step(self, kind: str) -> int:
         return int(
             next(
                 self._select(
@@ -267,7 +278,7 @@ class Store:
             )[0]
         )
 
-    def count(self, kind: str | None = None) -> int:
+    def count_rows(self, kind: str | None = None) -> int:
         condition, parameters = (
             ("", []) if kind is None else (" WHERE kind = ?", [kind])
         )
@@ -275,7 +286,7 @@ class Store:
             next(self._select(f"count(*) FROM evaluations{condition}", *parameters))[0]
         )
 
-    def missing(self, kind: str, count: int) -> Iterator[range]:
+    def find_missing_steps(self, kind: str, count: int) -> Iterator[range]:
         """Yield the steps from 0 to `count` of which there is no row of a kind,
         neighbours together.
         """
@@ -289,11 +300,11 @@ class Store:
         if expected < count:
             yield range(expected, count)
 
-    def counts(self) -> dict[str, int]:
+    def count_by_kind(self) -> dict[str, int]:
         what = "kind, count(*) FROM evaluations GROUP BY kind ORDER BY kind"
         return {str(kind): count for kind, count in self._select(what)}
 
-    def note(self, key: str) -> str | None:
+    def read_note(self, key: str) -> str | None:
         return next(
             (
                 str(text)
@@ -302,9 +313,9 @@ class Store:
             None,
         )
 
-    def noted(self, key: str) -> Any:
+    def read_json_note(self, key: str) -> Any:
         """Return the JSON value that was noted under `key`, or None."""
-        text = self.note(key)
+        text = self.read_note(key)
         try:
             return None if text is None else parse_json(text)
         except ValueError as error:
@@ -318,9 +329,9 @@ class Store:
         """Whether a model behind an address has answered, which took time and money."""
         return any(self._select("key FROM meta WHERE key LIKE ? LIMIT 1", "answer %"))
 
-    def set_note(self, key: str, value: str) -> None:
+    def write_note(self, key: str, value: str) -> None:
         """Keep a text under `key`, in place of what was there."""
-        check_there(self.path)
+        check_not_moved(self.path)
         with storage_errors(self.path), self._db:
             self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))
 
@@ -343,32 +354,34 @@ class Store:
 
 
 _FIELDS = tuple(field.name for field in fields(Row))
-_OTHERS = _FIELDS[:-2]  # without the time and the id
+_ENCODED_FIELDS = _FIELDS[:-2]  # without the time and the id
 _SIMPLE = frozenset({str, int, bool, type(None)})
 _JSON = json.JSONEncoder(allow_nan=False)
 
 
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     values = []
-    for name in _OTHERS:
+    for name in _ENCODED_FIELDS:
         value = getattr(row, name)
         if name in _AS_JSON and value is not None:
             try:
                 value = _JSON.encode(value) if value or name != "metrics" else None
             except (TypeError, ValueError):
-                value = _JSON.encode(plain(value))
+                value = _JSON.encode(to_json_value(value))
         elif type(value) not in _SIMPLE and not (
             type(value) is float and math.isfinite(value)
         ):
-            value = plain(value)
+            value = to_json_value(value)
         values.append(value)
     return (*values, stamp, row.id)
 
 
-_HELD: dict[Any, tuple[type, ...]] = {bool: (int,), float: (float, int)}
+_PYTHON_TYPES: dict[Any, tuple[type, ...]] = {bool: (int,), float: (float, int)}
 _TYPES: dict[str, tuple[type, ...]] = {
     name: tuple(
-        held for kind in get_args(hint) or (hint,) for held in _HELD.get(kind, (kind,))
+        held
+        for kind in get_args(hint) or (hint,)
+        for held in _PYTHON_TYPES.get(kind, (kind,))
     )
     for name, hint in get_type_hints(Row).items()
 } | {"payload": (str, type(None)), "metrics": (str, type(None)), "values": (str,)}
@@ -376,9 +389,9 @@ _TYPES: dict[str, tuple[type, ...]] = {
 
 _INFINITE = (math.inf, -math.inf)
 # larger numbers are none in rows: what is reckoned from them would overflow
-LARGEST_NUMBER = 1e300
+MAX_NUMBER = 1e300
 
-MOST_STEPS = (1 << 32) - 1
+MAX_STEP = (1 << 32) - 1
 
 
 def _decode(values: tuple[Any, ...], path: Path) -> Row:
@@ -388,12 +401,14 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
         for name, value in by_name.items()
         if not isinstance(value, _TYPES[name]) or value in _INFINITE
     ]
-    if not wrong_columns and not 0 <= by_name["step"] <= MOST_STEPS:
+    if not wrong_columns and not 0 <= by_name["step"] <= MAX_STEP:
         wrong_columns = ["step"]
     if not wrong_columns:
-        by_name["values"] = _named(by_name["values"], _is_value)
+        by_name["values"] = _parse_named(by_name["values"], _is_value)
         by_name["metrics"] = (
-            {} if by_name["metrics"] is None else _named(by_name["metrics"], _is_metric)
+            {}
+            if by_name["metrics"] is None
+            else _parse_named(by_name["metrics"], _is_metric)
         )
         wrong_columns = [
             f"{name}_json" for name in ("values", "metrics") if by_name[name] is None
@@ -413,7 +428,7 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
     return Row(**by_name)
 
 
-def _told(values: tuple[Any, ...], path: Path) -> Told:
+def _decode_cached(values: tuple[Any, ...], path: Path) -> CachedEvaluation:
     number, u, non_finite, cost, gradient, picture, height = values
     try:
         if [type(value) for value in (number, u, non_finite, cost)] != [
@@ -423,7 +438,7 @@ def _told(values: tuple[Any, ...], path: Path) -> Told:
             int,
         ]:
             raise TypeError("a number that is none")
-        return Told(
+        return CachedEvaluation(
             number,
             u,
             non_finite,
@@ -439,7 +454,7 @@ def _told(values: tuple[Any, ...], path: Path) -> Told:
         ) from None
 
 
-def _named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | None:
+def _parse_named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | None:
     """What a JSON object has by name; None where it is none, or something in it does
     not fit.
     """
@@ -463,5 +478,5 @@ def _is_value(entry: object) -> bool:
 
 def _is_metric(value: object) -> bool:
     return value is None or (
-        isinstance(value, (int, float)) and -LARGEST_NUMBER <= value <= LARGEST_NUMBER
+        isinstance(value, (int, float)) and -MAX_NUMBER <= value <= MAX_NUMBER
     )

@@ -27,11 +27,16 @@ from advsearch.errors import FileFormatError
 from advsearch.files import split_paths
 from advsearch.runs.results import RUNNING, Result, kind_of
 from advsearch.settings.configuration import FILES
-from advsearch.trust.stored_files import opened_for, parse_json, read_bytes, read_text
+from advsearch.trust.stored_files import (
+    list_opened_files,
+    parse_json,
+    read_bytes,
+    read_text,
+)
 from advsearch.trust.writing import is_held, write_bytes, write_text
 
 NAME = "summary.json"
-LARGEST = 64 << 20
+MAX_SUMMARY_BYTES = 64 << 20
 
 
 def to_json(result: Result) -> str:
@@ -50,31 +55,31 @@ def read_result(folder: Path) -> Result:
     has not come to its end; a FileFormatError says if there is none, or not what this
     version writes.
     """
-    result = stored_result(folder)
+    result = read_stored_result(folder)
     return (
         result.model_copy(update={"ending": RUNNING})
-        if result.goes_on and is_held(folder)
+        if result.is_unfinished and is_held(folder)
         else result
     )
 
 
-def stored_result(folder: Path) -> Result:
+def read_stored_result(folder: Path) -> Result:
     """Return the result of the run in `folder` as it was written, whoever works on
     it.
     """
     path = folder / NAME
     try:
         values = parse_json(
-            read_text(path, "the summary of a run", LARGEST), finite=True
+            read_text(path, "the summary of a run", MAX_SUMMARY_BYTES), finite=True
         )
     except FileNotFoundError:
-        raise other_summary(path, "no such file; did the run end?") from None
+        raise make_summary_error(path, "no such file; did the run end?") from None
     except (OSError, ValueError) as error:
-        raise other_summary(path, str(error)) from None
+        raise make_summary_error(path, str(error)) from None
     if not isinstance(values, dict):
-        raise other_summary(path, type(values).__name__)
+        raise make_summary_error(path, type(values).__name__)
     if (kind := kind_of(values)) is None:
-        raise other_summary(
+        raise make_summary_error(
             path, f"one of the command {str(values.get('command'))[:40]!r}"
         )
     try:
@@ -85,18 +90,18 @@ def stored_result(folder: Path) -> Result:
         got = (
             f"one with a part that is missing or of another type ({what}); run it again"
         )
-        raise other_summary(path, got) from None
+        raise make_summary_error(path, got) from None
 
 
-def other_summary(path: Path, got: str) -> FileFormatError:
+def make_summary_error(path: Path, got: str) -> FileFormatError:
     return FileFormatError(f"{path}: expected the summary of a run, got {got}")
 
 
 CONFIGURATION = "adversarial.npy"
 FOLDER = "artifacts"
-LARGEST_CONFIGURATION = 1 << 30
+MAX_CONFIGURATION_BYTES = 1 << 30
 MAGIC = b"\x93NUMPY\x01\x00"  # how a file of numpy's begins, of version 1.0
-MOST = 1 << 10  # bytes within which a header ends
+MAX_HEADER_BYTES = 1 << 10  # bytes within which a header ends
 HEADER = re.compile(
     re.escape(MAGIC)
     + rb"..\{'descr': '<f4', 'fortran_order': False, 'shape': \((\d{1,12}),\), \} *\n",
@@ -124,13 +129,13 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
     expected = f"{path}: expected the adversarial configuration of a run, got"
     try:
         data = read_bytes(
-            path, "the adversarial configuration of a run", LARGEST_CONFIGURATION
+            path, "the adversarial configuration of a run", MAX_CONFIGURATION_BYTES
         )
     except FileNotFoundError:
         raise FileFormatError(f"{expected} no such file; did the run end?") from None
     except OSError as error:
         raise FileFormatError(f"{expected} {str(error)[:120]}") from None
-    if not data.startswith(MAGIC) or b"\n" not in data[: len(MAGIC) + MOST]:
+    if not data.startswith(MAGIC) or b"\n" not in data[: len(MAGIC) + MAX_HEADER_BYTES]:
         raise FileFormatError(f"{expected} something else, or the beginning of one")
     header = HEADER.match(data)
     if header is not None and len(data) == header.end() + 4 * int(header[1]):
@@ -144,8 +149,8 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
     )
 
 
-MADE_WITH = "made with"  # the note of versions and of digests of files
-MOST_FILES = 20_000  # files of a folder that a digest is taken of, at most
+VERSIONS_NOTE = "made with"  # the note of versions and of digests of files
+MAX_FILES = 20_000  # files of a folder that a digest is taken of, at most
 FOLDERS = {"task": "*/*", "model": "*"}
 """Settings that may name a folder, and which files in it decide: a task's pictures, or
 what `hf:FOLDER` consists of.
@@ -159,7 +164,7 @@ file.
 """
 
 
-def made_with(settings: Mapping[str, object]) -> dict[str, str]:
+def collect_versions(settings: Mapping[str, object]) -> dict[str, str]:
     """Return versions by package, and the SHA-256 of each file that settings name, by
     its name in them.
     """
@@ -167,7 +172,11 @@ def made_with(settings: Mapping[str, object]) -> dict[str, str]:
     for name in PACKAGES:
         with suppress(metadata.PackageNotFoundError):
             facts[name] = metadata.version(name)
-    return {**facts, **bundled_digests(settings), **file_digests(settings)}
+    return {
+        **facts,
+        **compute_bundled_digests(settings),
+        **compute_file_digests(settings),
+    }
 
 
 BUNDLED = {"objects": "object", "environments": "environment"}
@@ -188,7 +197,7 @@ NAMES_BUNDLED = (
 """Settings that name objects and environments."""
 
 
-def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
+def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
     """Return the SHA-256 of what is bundled and settings name: objects, environments
     and the reference model.
     """
@@ -196,7 +205,7 @@ def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
     names = {
         name
         for setting in NAMES_BUNDLED
-        for name in _bundled_names(settings.get(setting))
+        for name in _find_bundled_names(settings.get(setting))
     }
     if (
         settings.get("object")
@@ -210,30 +219,34 @@ def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
             if entry.stem in names:
                 files = sorted(entry.iterdir()) if entry.is_dir() else [entry]
                 listing = "".join(
-                    f"{file.name} {_digest(file)}\n" for file in files if file.is_file()
+                    f"{file.name} {_digest_file(file)}\n"
+                    for file in files
+                    if file.is_file()
                 )
                 digests[f"bundled {kind} {entry.stem}"] = hashlib.sha256(
                     listing.encode()
                 ).hexdigest()
     weights = package / "models" / "data" / "reference.safetensors"
-    if "reference" in _bundled_names(settings.get("model")) and weights.is_file():
-        digests["bundled model reference"] = _digest(weights)
+    if "reference" in _find_bundled_names(settings.get("model")) and weights.is_file():
+        digests["bundled model reference"] = _digest_file(weights)
     return digests
 
 
-def _bundled_names(value: object) -> set[str]:
+def _find_bundled_names(value: object) -> set[str]:
     """Return what may be the name of something bundled in a setting: the words of
     ``mug,car@12,3.5; person@6,-2``, in lists and mappings, but for the paths of files.
     """
     if isinstance(value, Mapping):
-        return {name for inner in value.values() for name in _bundled_names(inner)}
+        return {name for inner in value.values() for name in _find_bundled_names(inner)}
     if isinstance(value, (list, tuple)):
-        return {name for inner in value for name in _bundled_names(inner)}
+        return {name for inner in value for name in _find_bundled_names(inner)}
     words = re.split(r"[,;+]", value) if isinstance(value, str) else []
     return {word.partition("@")[0].strip() for word in words}
 
 
-def changed_facts(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+def find_changed_facts(
+    before: Mapping[str, object], now: Mapping[str, object]
+) -> list[str]:
     """Return the names of facts that are others now than before; those that were not
     known before are none of them.
 
@@ -249,7 +262,7 @@ def changed_facts(before: Mapping[str, object], now: Mapping[str, object]) -> li
     ]
 
 
-def changed_file(
+def find_changed_file(
     before: Mapping[str, object], settings: Mapping[str, object]
 ) -> str | None:
     """Return the name of a file of some settings that is another one now than before;
@@ -258,17 +271,17 @@ def changed_file(
     again = {
         name: value for name, value in settings.items() if name not in NOT_READ_AGAIN
     }
-    return next(iter(changed_facts(before, file_digests(again))), None)
+    return next(iter(find_changed_facts(before, compute_file_digests(again))), None)
 
 
-def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
+def compute_file_digests(settings: Mapping[str, object]) -> dict[str, str]:
     """Return the SHA-256 of each file that settings name, in hexadecimal, and of each
     that was read for it: materials, pictures and buffers that a mesh or a scene names.
     A folder has one for all. What is bundled or gone has none.
     """
     digests: dict[str, str] = {}
     for name, value in settings.items():
-        for path in _paths(value):
+        for path in _find_paths(value):
             with suppress(OSError, ValueError):
                 for file_name, digest in _iterate_digests(name, path):
                     digests[file_name] = digest
@@ -283,7 +296,7 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
         ValueError: it is no possible path.
     """
     absolute_path = os.path.abspath(path)
-    opened_files = opened_for(absolute_path)
+    opened_files = list_opened_files(absolute_path)
     folder = ""
     if os.path.isabs(path):
         folder = path
@@ -292,34 +305,34 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
     if folder and setting in FOLDERS and Path(folder).is_dir():
         yield folder, _digest_folder(Path(folder), FOLDERS[setting])
     if (opened_files or setting in FILES) and Path(path).is_file():
-        yield path, _digest(Path(path))
+        yield path, _digest_file(Path(path))
     for opened_file in opened_files:
         if opened_file != absolute_path and Path(opened_file).is_file():
             relative = os.path.relpath(opened_file, os.path.dirname(absolute_path))
             file_name = os.path.join(os.path.dirname(path), relative)
-            yield file_name, _digest(Path(opened_file))
+            yield file_name, _digest_file(Path(opened_file))
 
 
 def _digest_folder(folder: Path, pattern: str) -> str:
     """Return one SHA-256 of the names and contents of the files that match a
     pattern.
     """
-    paths = sorted(islice(folder.glob(pattern), MOST_FILES))
+    paths = sorted(islice(folder.glob(pattern), MAX_FILES))
     lines = [
-        f"{path.relative_to(folder).as_posix()}\n{_digest(path)}"
+        f"{path.relative_to(folder).as_posix()}\n{_digest_file(path)}"
         for path in paths
         if path.is_file()
     ]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
-def _paths(value: object) -> Iterator[str]:
+def _find_paths(value: object) -> Iterator[str]:
     """What may be a file in ``a.pt2,reference@weights.safetensors``, ``scene.glb#NODE``
     or ``camera.csv+object.csv``, in lists and mappings.
     """
     if isinstance(value, (Mapping, list, tuple)):
         for inner in value.values() if isinstance(value, Mapping) else value:
-            yield from _paths(inner)
+            yield from _find_paths(inner)
     elif isinstance(value, str):
         for name in value.split(","):
             parts = (
@@ -331,7 +344,7 @@ def _paths(value: object) -> Iterator[str]:
             yield from dict.fromkeys(part.strip() for part in parts if part.strip())
 
 
-def _digest(path: Path) -> str:
+def _digest_file(path: Path) -> str:
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while part := file.read(1 << 20):

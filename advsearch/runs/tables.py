@@ -21,7 +21,7 @@ from pydantic.dataclasses import dataclass
 
 from advsearch.errors import FileFormatError
 from advsearch.options import NOT_A_NUMBER, get_outcome
-from advsearch.runs.export import as_columns, as_record, each_value
+from advsearch.runs.export import iterate_values, list_columns, make_record
 from advsearch.runs.store import NAME, Row, Store
 
 # --------------------------------------------------------------------------------
@@ -31,16 +31,16 @@ from advsearch.runs.store import NAME, Row, Store
 # nothing is drawn, samples of a point of the grid differ in noise alone: they are one
 # unit.
 
-NOTE = "units"  # the note of a run that says it
+UNITS_NOTE = "units"  # the note of a run that says it
 PICTURE = "picture"
 CONFIGURATION = "configuration"
 DRIVE = "drive"
 
 Number = TypeVar("Number", int, npt.NDArray[np.int64])
 
-MOST_AXES = 1024
-MOST_ROWS = 1 << 62  # of a whole sweep: numbers of rows are int64
-Count = Annotated[int, Field(strict=True, ge=1, le=MOST_ROWS)]
+MAX_AXES = 1024
+MAX_ROWS = 1 << 62  # of a whole sweep: numbers of rows are int64
+Count = Annotated[int, Field(strict=True, ge=1, le=MAX_ROWS)]
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,13 @@ class Units:
     """How rows follow from draws."""
 
     # of the axes of the grid, the last one fastest
-    sizes: Annotated[tuple[Count, ...], Field(max_length=MOST_AXES)] = ()
+    sizes: Annotated[tuple[Count, ...], Field(max_length=MAX_AXES)] = ()
     # place of the axis whose values are frames
     frames: Annotated[int, Field(strict=True, ge=0)] | None = None
     samples: Count = 1  # draws at each point of the grid
     models: Count = 1  # that are shown the same pictures
     # pictures after which the draws come again; 0 for never
-    again: Annotated[int, Field(strict=True, ge=0, le=MOST_ROWS)] = 0
+    again: Annotated[int, Field(strict=True, ge=0, le=MAX_ROWS)] = 0
     noise: Count = 1  # pictures of each draw that differ in noise alone
 
     @property
@@ -69,44 +69,44 @@ class Units:
             return DRIVE
         return CONFIGURATION if self.noise > 1 else PICTURE
 
-    def of(self, step: Number) -> Number:
+    def find_unit(self, step: Number) -> Number:
         """Return the number of the unit of a row, or of rows (n,), by their steps."""
-        return self.draw(step // self.models)
+        return self.find_draw(step // self.models)
 
-    def draw(self, picture: Number) -> Number:
+    def find_draw(self, image_index: Number) -> Number:
         """Return the number of the draw of a picture, by its number in the whole
         sweep.
         """
         if self.again:
-            picture = picture % self.again
-        picture = picture // self.noise
+            image_index = image_index % self.again
+        image_index = image_index // self.noise
         if self.frames is None:
-            return picture
-        point = picture // self.samples
-        sample = picture % self.samples
+            return image_index
+        point = image_index // self.samples
+        sample = image_index % self.samples
         after = prod(self.sizes[self.frames + 1 :])
         # scenes are like one more axis, the slowest
         before = point // (self.sizes[self.frames] * after)
         return (before * after + point % after) * self.samples + sample
 
 
-def units_of(store: Store, *, is_drawn: bool = True) -> Units | None:
+def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
     """Return what a run notes of its units; None where it notes nothing. Older notes do
     not say that samples are noise: the summary's sampler does, so that the caller says
-    whether anything `is_drawn`.
+    whether anything `is_sampled`.
     """
-    noted = store.noted(NOTE)
+    noted = store.read_json_note(UNITS_NOTE)
     if noted is None:
         return None
     with suppress(ValidationError):
         units = TypeAdapter(Units).validate_python(noted)
-        if not is_drawn and units.noise == 1:
+        if not is_sampled and units.noise == 1:
             units = replace(units, samples=1, noise=units.samples)
         has_frames = units.frames is None or units.frames < len(units.sizes)
         if (
             has_frames
             and prod(units.sizes) * units.samples * units.noise * units.models
-            <= MOST_ROWS
+            <= MAX_ROWS
         ):
             return units
     raise FileFormatError(
@@ -115,18 +115,27 @@ def units_of(store: Store, *, is_drawn: bool = True) -> Units | None:
 
 
 KIND = "sweep"  # rows of the sweep itself
-EDGES = "parts of ranges"
+EDGES_NOTE = "parts of ranges"
 """The note of a run that says where the range of each drawn parameter is cut: the ends
 of the parts, by name.
 """
 
-SAID = ("id", "step", "correct", "margin", "probability", "seconds", "label", "outcome")
+FIXED_COLUMNS = (
+    "id",
+    "step",
+    "correct",
+    "margin",
+    "probability",
+    "seconds",
+    "label",
+    "outcome",
+)
 """Columns of a sweep's frame before those of its parameters; `unit` is the last one."""
 
 # rows that become numbers and names at once, so that a million rows fit
-AT_ONCE = 10_000
+CHUNK_ROWS = 10_000
 # names that a parameter cannot have in a frame
-TAKEN = {*(field.name for field in fields(Row)), "unit", "outcome"}
+RESERVED_NAMES = {*(field.name for field in fields(Row)), "unit", "outcome"}
 
 
 def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
@@ -136,9 +145,9 @@ def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
     "degrees".
     """
     row_list = list(rows)
-    names = {column: column.partition(" [")[0] for column in as_columns(row_list)}
+    names = {column: column.partition(" [")[0] for column in list_columns(row_list)}
     records = [
-        {names[name]: value for name, value in as_record(row).items()}
+        {names[name]: value for name, value in make_record(row).items()}
         for row in row_list
     ]
     frame = pd.DataFrame(records, columns=list(names.values()))
@@ -153,24 +162,26 @@ def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
 def read_sweep(
     run: Path,
     after: int = 0,
-    most: int | None = None,
-    also: Callable[[Row], Mapping[str, float]] | None = None,
+    max_rows: int | None = None,
+    extra_columns: Callable[[Row], Mapping[str, float]] | None = None,
     *,
-    is_drawn: bool = True,
+    is_sampled: bool = True,
 ) -> pd.DataFrame:
     """Return the rows of the sweep in `run` that were written after the row with this
-    id, `most` of them at most, as `sweep_frame` does; `unit` says which rows are not
-    independent (`Units`, `units_of`), ``attrs["unit name"]`` what such a unit is, and
+    id, `max_rows` of them at most, as `make_sweep_frame` does; `unit` says which rows are not
+    independent (`Units`, `read_units`), ``attrs["unit name"]`` what such a unit is, and
     ``attrs["edges"]`` where the ranges of drawn parameters are cut. Raises
     FileFormatError where the results cannot be read.
     """
     with Store(run / NAME, read_only=True) as store:
-        frame = sweep_frame(islice(store.rows(KIND, after=after), most), also)
-        noted = store.noted(EDGES)
-        units = units_of(store, is_drawn=is_drawn)
+        frame = make_sweep_frame(
+            islice(store.rows(KIND, after=after), max_rows), extra_columns
+        )
+        noted = store.read_json_note(EDGES_NOTE)
+        units = read_units(store, is_sampled=is_sampled)
     frame.attrs["unit name"] = PICTURE if units is None else units.name
     if units is not None:
-        frame["unit"] = units.of(frame["step"].to_numpy())
+        frame["unit"] = units.find_unit(frame["step"].to_numpy())
     for name, ends in noted.items() if isinstance(noted, dict) else ():
         if (
             isinstance(ends, list)
@@ -181,11 +192,12 @@ def read_sweep(
     return frame
 
 
-def sweep_frame(
-    rows: Iterable[Row], also: Callable[[Row], Mapping[str, float]] | None = None
+def make_sweep_frame(
+    rows: Iterable[Row],
+    extra_columns: Callable[[Row], Mapping[str, float]] | None = None,
 ) -> pd.DataFrame:
-    """Return rows of a sweep as a frame: `SAID`, a column for each parameter and for
-    what is `also` told of a row, and `unit`, which here is the step.
+    """Return rows of a sweep as a frame: `FIXED_COLUMNS`, a column for each parameter and for
+    what is `extra_columns` told of a row, and `unit`, which here is the step.
 
     Numbers are float64, NaN where a row has none; `correct` is 1 or 0, NaN where it was
     not judged. `label`, `outcome` (of `options.Outcome`, "" where a row has none) and
@@ -196,10 +208,13 @@ def sweep_frame(
     units = dict[str, str]()
     frames = list[pd.DataFrame]()
     cells = (
-        {**_cells(row, number, units), **(also(row) if also else {})}
+        {
+            **_make_cells(row, number, units),
+            **(extra_columns(row) if extra_columns else {}),
+        }
         for number, row in enumerate(rows, 1)
     )
-    while chunk := list(islice(cells, AT_ONCE)):
+    while chunk := list(islice(cells, CHUNK_ROWS)):
         chunk_frame = pd.DataFrame(chunk, dtype=object)
         frames.append(
             chunk_frame.astype(
@@ -213,17 +228,17 @@ def sweep_frame(
     frame = (
         pd.concat(frames, ignore_index=True)
         if frames
-        else pd.DataFrame(dict.fromkeys(SAID, np.zeros(0)))
+        else pd.DataFrame(dict.fromkeys(FIXED_COLUMNS, np.zeros(0)))
     )
     for name in frame.select_dtypes("object"):
-        frame[name] = _names(frame[name])
+        frame[name] = _to_categories(frame[name])
     frame = frame.astype({"id": np.int64, "step": np.int64})
     frame["unit"] = frame["step"]
     frame.attrs |= {"units": units, "edges": {}}
     return frame
 
 
-def _cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
+def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
     """What is known of a row, the `number`-th, by column; `units` gets those of its
     parameters.
     """
@@ -239,20 +254,20 @@ def _cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
     outcome = get_outcome(row.payload)
     cells: dict[str, Any] = dict(
         zip(
-            SAID,
+            FIXED_COLUMNS,
             (*fixed_values, label, "" if outcome is None else outcome.value),
             strict=True,
         )
     )
     for name, described in row.values.items():
-        parameter_name = f"parameter {name}" if name in TAKEN else name
-        for column, value, unit in each_value({parameter_name: described}):
+        parameter_name = f"parameter {name}" if name in RESERVED_NAMES else name
+        for column, value, unit in iterate_values({parameter_name: described}):
             units.setdefault(column, unit)
             cells[column] = sys.intern(value) if isinstance(value, str) else value
     return cells
 
 
-def _names(column: pd.Series) -> pd.Categorical:
+def _to_categories(column: pd.Series) -> pd.Categorical:
     """Return a column that has names as categories, in the order in which they come;
     numbers among them follow.
     """

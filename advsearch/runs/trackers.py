@@ -22,10 +22,12 @@ from advsearch.runs.store import Row
 
 PACKAGES = {"mlflow": "mlflow", "tensorboard": "tensorboard.summary", "wandb": "wandb"}
 """The trackers, and what of each is imported."""
-NUMBERS = ("objective", "score", "margin", "correct", "success", "probability")
-PATIENCE = 10.0  # seconds that the end of a run waits for what is still to be told
-WAITING = 10_000  # messages that may wait; further ones are not told
-LONGEST = 250
+METRICS = ("objective", "score", "margin", "correct", "success", "probability")
+MAX_CLOSE_SECONDS = (
+    10.0  # seconds that the end of a run waits for what is still to be told
+)
+MAX_QUEUED = 10_000  # messages that may wait; further ones are not told
+MAX_TEXT_LENGTH = 250
 _LOG = logging.getLogger("advsearch")
 
 
@@ -34,10 +36,10 @@ def check_tracker(name: str | None) -> None:
         return
     if name not in PACKAGES:
         raise UnknownNameError("log", name, PACKAGES)
-    _package(name)
+    _import_package(name)
 
 
-def _package(name: str) -> Any:
+def _import_package(name: str) -> Any:
     try:
         return importlib.import_module(PACKAGES[name])
     except ImportError:
@@ -51,10 +53,10 @@ class Tracker:
 
     def __init__(self, name: str, folder: Path, settings: JsonObject) -> None:
         self._name = name
-        self._right: dict[str, list[int]] = defaultdict(lambda: [0, 0])
-        self._waiting: Queue[tuple[MetricValues, int] | None] = Queue(WAITING)
+        self._accuracy_counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
+        self._queue: Queue[tuple[MetricValues, int] | None] = Queue(MAX_QUEUED)
         setting_texts = {
-            key: str(value)[:LONGEST]
+            key: str(value)[:MAX_TEXT_LENGTH]
             for key, value in settings.items()
             if value is not None
         }
@@ -63,24 +65,24 @@ class Tracker:
         )
         self._thread.start()
 
-    def rows(self, rows: Sequence[Row]) -> None:
+    def send_rows(self, rows: Sequence[Row]) -> None:
         """Tell rows that were kept; returns at once."""
         kinds: dict[str, list[Row]] = defaultdict(list)
         for row in rows:
             kinds[row.kind].append(row)
         for kind, group in kinds.items():
-            self._put((self._numbers(kind, group), group[-1].step))
+            self._put((self._compute_metrics(kind, group), group[-1].step))
 
     def close(self) -> None:
-        """Wait, at most `PATIENCE` seconds, until all is told; a second call does
+        """Wait, at most `MAX_CLOSE_SECONDS` seconds, until all is told; a second call does
         nothing.
         """
         self._put(None)
-        self._thread.join(PATIENCE)
+        self._thread.join(MAX_CLOSE_SECONDS)
 
-    def _numbers(self, kind: str, rows: Sequence[Row]) -> MetricValues:
+    def _compute_metrics(self, kind: str, rows: Sequence[Row]) -> MetricValues:
         metrics = {}
-        for name in NUMBERS:
+        for name in METRICS:
             values = [
                 float(value)
                 for row in rows
@@ -89,7 +91,7 @@ class Tracker:
             if values:
                 metrics[f"{kind}/{name}"] = sum(values) / len(values)
         is_right = [row.correct for row in rows if row.correct is not None]
-        counts = self._right[kind]
+        counts = self._accuracy_counts[kind]
         counts[0] += sum(is_right)
         counts[1] += len(is_right)
         if counts[1]:
@@ -98,14 +100,14 @@ class Tracker:
 
     def _put(self, message: tuple[MetricValues, int] | None) -> None:
         try:
-            self._waiting.put_nowait(message)
+            self._queue.put_nowait(message)
         except Full:
             return  # a tracker that is that slow is told less; the run has all of it
 
     def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
         try:
-            tell, close = _opened(self._name, folder, settings)
-            while (message := self._waiting.get()) is not None:
+            tell, close = _open_tracker(self._name, folder, settings)
+            while (message := self._queue.get()) is not None:
                 tell(*message)
             close()
         except Exception as error:  # whatever a tracker does, the run goes on
@@ -116,13 +118,13 @@ class Tracker:
             )
 
 
-def _opened(
+def _open_tracker(
     name: str, folder: Path, settings: Mapping[str, str]
 ) -> tuple[Callable[[MetricValues, int], object], Callable[[], object]]:
     """Return what tells a tracker numbers by name, of a step of their kind, and what
     ends its run.
     """
-    package = _package(name)
+    package = _import_package(name)
     if name == "mlflow":
         package.start_run(run_name=folder.name, nested=True)
         package.log_params(settings)

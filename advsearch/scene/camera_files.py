@@ -44,8 +44,8 @@ from advsearch.scene.camera_model import (
     CameraModel,
 )
 from advsearch.scene.importing.files import CAMERA_FORMAT_ADVICE, format_name
-from advsearch.trust.stored_files import parse_json, parsed, present_text
-from advsearch.trust.yaml_text import LARGEST, parse_yaml
+from advsearch.trust.stored_files import parse_json, parse_text, read_existing_text
+from advsearch.trust.yaml_text import MAX_YAML_BYTES, parse_yaml
 
 # Limit of the bytes of a JSON file, which may have the pose of every image.
 MAX_JSON_SIZE = 1 << 25
@@ -184,8 +184,8 @@ def read_camera(spec: str) -> CameraModel:
             f"{path}: expected a camera file, got a mesh; it is an "
             "object's, not a camera's"
         )
-    limit = MAX_JSON_SIZE if suffix == ".json" else LARGEST
-    text = present_text(path, "a camera file", limit)
+    limit = MAX_JSON_SIZE if suffix == ".json" else MAX_YAML_BYTES
+    text = read_existing_text(path, "a camera file", limit)
     lines = _list_lines(text)
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
         return _read_colmap(spec, path, which, lines)
@@ -236,13 +236,13 @@ def _parse_file(path: str, text: str) -> dict[str, Any]:
     if text.lstrip().startswith("<"):
         return _parse_xml(path, text)
     if path.lower().endswith(".json"):
-        data = parsed(path, text, "JSON", parse_json)
+        data = parse_text(path, text, "JSON", parse_json)
     else:
         # OpenCV's YAML has a directive and tags that are not standard.
         text = re.sub(r"\A%YAML[^\n]*\n", "", text)
         text = re.sub(r"!!opencv-(nd-)?matrix", "", text)
         text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
-        data = parsed(path, text, "YAML, or COLMAP's cameras.txt", parse_yaml)
+        data = parse_text(path, text, "YAML, or COLMAP's cameras.txt", parse_yaml)
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
         got = "an empty file" if data is None else f"a {type(data).__name__}"
         raise FileFormatError(
@@ -260,7 +260,7 @@ def _parse_xml(path: str, text: str) -> dict[str, Any]:
             f"{path}: declares a document type or entities, "
             "which no camera needs; remove it"
         )
-    root = parsed(path, text, "XML", ElementTree.fromstring)
+    root = parse_text(path, text, "XML", ElementTree.fromstring)
     check_xml_root(path, root.tag)
     if root.tag not in ("opencv_storage", METASHAPE_FILE):
         raise FileFormatError(

@@ -84,7 +84,7 @@ from advsearch.scene.things import (
     add_things,
     find_ground_height,
 )
-from advsearch.trust.stored_files import reading
+from advsearch.trust.stored_files import track_opened_files
 
 DEFAULT_ENVIRONMENT = "studio"
 OBJECT = "object"  # the name of the mesh under test
@@ -283,7 +283,7 @@ class SceneDescription:
                 if rig[0].fov is not None:
                     scene = scene.with_values(camera__fov=rig[0].fov)
             else:
-                with reading(camera.partition("#")[0]):
+                with track_opened_files(camera.partition("#")[0]):
                     model = read_camera(camera)
         if model is not None:
             model.check_no_fov(self.requested)
@@ -644,7 +644,7 @@ def load_description(
     object_spec: str | Path | ObjectAsset,
     environment_spec: str | Path | EnvironmentAsset | None = None,
     *,
-    given: settings.SettingValues | None = None,
+    setting_values: settings.SettingValues | None = None,
     up: str | None = None,
     facing: str | None = None,
     size: float | None = None,
@@ -661,7 +661,7 @@ def load_description(
     Args:
         object_spec: with `plugins` the id of a shape.
         environment_spec: `NO_ENVIRONMENT` is no map at all.
-        given: settings of the scene by name.
+        setting_values: settings of the scene by name.
         up: the up axis of a mesh file.
         facing: the axis of a mesh file that is its front.
         size: longest side of the object, metres.
@@ -669,8 +669,8 @@ def load_description(
         plugins: a Mitsuba scene as its loader takes it.
         things: what stands beside the object.
     """
-    given = given or {}
-    values = settings.resolve_settings(given)
+    setting_values = setting_values or {}
+    values = settings.resolve_settings(setting_values)
     file: str | Path | ObjectAsset = object_spec
     node = None
     if isinstance(object_spec, str):
@@ -694,18 +694,18 @@ def load_description(
     if is_mitsuba and imported.object.emission is not None:
         is_lit = True
     lit_by = environment_spec or (NO_ENVIRONMENT if is_lit else DEFAULT_ENVIRONMENT)
-    check_ground(given, lit_by)
+    check_ground(setting_values, lit_by)
     if lit_by != NO_ENVIRONMENT:
         check_single_environment(
             imported.surroundings, f"`environment={_spec_text(lit_by)}`"
         )
-    if is_scene_file and not {"ground.size", "ground.kind"} & set(given):
+    if is_scene_file and not {"ground.size", "ground.kind"} & set(setting_values):
         values["ground.size"] = 0.0
-    requested = set(given)
+    requested = set(setting_values)
     if environment_spec is not None:
         requested.add(ENVIRONMENT)
     camera = ORBIT_CAMERA
-    if is_mitsuba and not _describes_orbit(given):
+    if is_mitsuba and not _describes_orbit(setting_values):
         camera = next(iter(imported.cameras), ORBIT_CAMERA)
     described = SceneDescription(
         imported.object,
@@ -726,7 +726,7 @@ def load_description(
     described = add_things(with_requested_ground(described), things, _load_thing)
     described = add_lamps(add_solid_remarks(described))
     check_mesh_names(described, values)
-    _check_material_settings(described.object, given)
+    _check_material_settings(described.object, setting_values)
     return described
 
 
@@ -750,7 +750,7 @@ def _check_axes(
 
 def _import_scene_file(path: Path, node: str, *, is_mitsuba: bool) -> ImportedScene:
     """Read a glTF scene or a Mitsuba scene around one of its nodes or shapes."""
-    with reading(path):
+    with track_opened_files(path):
         if not is_mitsuba:
             return import_scene(path, node)
         # a circle: it takes descriptions
@@ -785,7 +785,7 @@ def _load_environment(
     if is_place_file(lit_by):
         return import_place(str(lit_by))
     if is_path(lit_by):
-        with reading(lit_by):
+        with track_opened_files(lit_by):
             return library.import_environment(Path(lit_by))
     return library.load_environment(str(lit_by))
 
@@ -886,7 +886,7 @@ def _load_object(
             known_up = "y"
         elif up == "z":
             known_up = "z"
-        with reading(spec):
+        with track_opened_files(spec):
             return import_object(Path(spec), up=known_up, facing=facing)
     if up is not None:
         raise InputError(

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from advsearch.pictures import png_of
+from advsearch.pictures import encode_levels
 from advsearch.scene.assets import Float32Array, Float64Array, Shape
 from advsearch.scene.color import linear_to_srgb
 
@@ -125,7 +125,7 @@ CAMERA_ENTRY = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.0
 def encode_glb(meshes: Sequence[Shape]) -> bytes:
     """Return meshes as a binary glTF file with PNG textures."""
     buffer = GlbBuffer()
-    return buffer.to_bytes(_make_header(buffer, meshes, png_of))
+    return buffer.to_bytes(_make_header(buffer, meshes, encode_levels))
 
 
 def encode_web_glb(
@@ -316,7 +316,7 @@ def _encode_png_with_alpha(color: ByteImage, opacity: ByteImage) -> bytes:
     picture.putalpha(
         Image.fromarray(opacity).resize(picture.size, Image.Resampling.BILINEAR)
     )
-    return png_of(np.asarray(picture))
+    return encode_levels(np.asarray(picture))
 
 
 def _encode_jpeg(color: ByteImage) -> bytes:

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.errors import InputError
-from advsearch.pictures import png_of
+from advsearch.pictures import encode_levels
 from advsearch.scene.assembly import IMAGE_INPUTS, Motion, write_central_differences
 from advsearch.scene.color import to_uint8
 from advsearch.scene.description import OBJECT, SceneDescription
@@ -167,7 +167,7 @@ class Renderer:
     def _repr_png_(self) -> bytes:
         """Return the start as a notebook shows it; it does not count as a render."""
         with torch.no_grad():
-            return png_of(to_uint8(self.copy_with()(self.start)).numpy())
+            return encode_levels(to_uint8(self.copy_with()(self.start)).numpy())
 
     @property
     def composition_reason(self) -> str:

@@ -24,8 +24,13 @@ from advsearch.scene.camera_files import LENS_KEYS, MAX_JSON_SIZE, read_camera
 from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.geometry import make_rotation
 from advsearch.scene.skeleton import rotation_entries
-from advsearch.trust.stored_files import parse_json, parsed, present_text, read_text
-from advsearch.trust.yaml_text import LARGEST, parse_yaml
+from advsearch.trust.stored_files import (
+    parse_json,
+    parse_text,
+    read_existing_text,
+    read_text,
+)
+from advsearch.trust.yaml_text import MAX_YAML_BYTES, parse_yaml
 
 MAX_CAMERAS = 32
 MAX_DISTANCE = 1e4  # limit of the distance to the first camera, metres or object sizes
@@ -119,7 +124,7 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
     if which or Path(spec).suffix.lower() not in (".yaml", ".yml"):
         return ()
     try:
-        data = parse_yaml(read_text(Path(spec), "a camera file", LARGEST))
+        data = parse_yaml(read_text(Path(spec), "a camera file", MAX_YAML_BYTES))
     except (OSError, ValueError):
         return ()  # `read_camera` reports what is wrong with it
     if not isinstance(data, dict):
@@ -254,8 +259,8 @@ def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
 
 def _read_transforms(path: str, frame_names: str) -> tuple[Mount, ...]:
     """Return frames of nerfstudio's transforms.json as cameras."""
-    text = present_text(path, "a camera file", MAX_JSON_SIZE)
-    data = parsed(path, text, "JSON", parse_json)
+    text = read_existing_text(path, "a camera file", MAX_JSON_SIZE)
+    data = parse_text(path, text, "JSON", parse_json)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(
         isinstance(frame, dict) for frame in frames
@@ -339,7 +344,7 @@ def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
     Every second line has a rotation (quaternion, real part first) and a shift from the
     world to the camera, whose model is in the cameras.txt beside it.
     """
-    text = present_text(path, "COLMAP's images", MAX_IMAGES_SIZE)
+    text = read_existing_text(path, "COLMAP's images", MAX_IMAGES_SIZE)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     rows = {words[0]: words for line in lines[::2] if (words := line.split(maxsplit=9))}
     if not rows:

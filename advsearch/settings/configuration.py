@@ -36,7 +36,7 @@ from pydantic import (
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.files import JsonObject, split_paths
 from advsearch.settings import values as written
-from advsearch.trust.powers import LeftOut, Power, none
+from advsearch.trust.powers import OmittedSetting, Power, no_power
 from advsearch.trust.stored_files import is_shallow
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Setting:
     switched: str = ""
     # Returns what a value does beyond the run, which only a person may request
     # (`trust.powers`).
-    power: Power = none
+    power: Power = no_power
     field: str = ""  # its name in the configuration
     name: str = ""  # its name in YAML
     required: bool = False
@@ -109,7 +109,7 @@ def setting(
     repeats: bool = False,
     read_texts: ReadTexts = written.parse_assignments,
     switched: str = "",
-    power: Power = none,
+    power: Power = no_power,
     **constraints: Any,
 ) -> Any:
     """Create a pydantic field from a `Setting`, with constraints of
@@ -291,7 +291,7 @@ class Config(BaseModel):
 
     _python_only_parts: tuple[PythonOnly, ...] = PrivateAttr(())
     _python_objects: dict[tuple[str, str], Any] = PrivateAttr(default_factory=dict)
-    _left_out: tuple[LeftOut, ...] = PrivateAttr(())
+    _left_out: tuple[OmittedSetting, ...] = PrivateAttr(())
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False
@@ -385,7 +385,7 @@ class Config(BaseModel):
         return config
 
     @property
-    def powers(self) -> tuple[LeftOut, ...]:
+    def powers(self) -> tuple[OmittedSetting, ...]:
         """The settings that have power over more than the run."""
         powers = []
         for setting in settings(type(self)):
@@ -393,12 +393,14 @@ class Config(BaseModel):
             effect = setting.power(value)
             if effect:
                 powers.append(
-                    LeftOut(setting.name, setting.field, value, effect, setting.default)
+                    OmittedSetting(
+                        setting.name, setting.field, value, effect, setting.default
+                    )
                 )
         return tuple(powers)
 
     @property
-    def left_out(self) -> tuple[LeftOut, ...]:
+    def left_out(self) -> tuple[OmittedSetting, ...]:
         """The settings of the file with power over more than the run, which count as
         not set.
         """
@@ -412,7 +414,7 @@ class Config(BaseModel):
         return {
             setting.name: getattr(self, setting.field)
             for setting in settings(type(self))
-            if setting.power is not none
+            if setting.power is not no_power
             and setting.name in self.free
             and setting.name not in RUN_LOCATION
         }

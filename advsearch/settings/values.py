@@ -17,8 +17,8 @@ from pydantic import ValidationInfo, field_validator
 
 from advsearch.distributions import PythonQuantiles
 from advsearch.errors import FileFormatError, InputError
-from advsearch.trust.stored_files import parsed, present_text
-from advsearch.trust.yaml_text import LARGEST, parse_yaml
+from advsearch.trust.stored_files import parse_text, read_existing_text
+from advsearch.trust.yaml_text import MAX_YAML_BYTES, parse_yaml
 
 MAX_INTEGER = 2**63 - 1
 
@@ -259,7 +259,12 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
     Raises:
         FileFormatError: it is missing, not YAML or no mapping from names.
     """
-    data = parsed(path, present_text(path, "a YAML file", LARGEST), "YAML", parse_yaml)
+    data = parse_text(
+        path,
+        read_existing_text(path, "a YAML file", MAX_YAML_BYTES),
+        "YAML",
+        parse_yaml,
+    )
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
         got = "an empty file" if data is None else type(data).__name__
         raise FileFormatError(

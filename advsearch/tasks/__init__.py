@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from advsearch.catalog import list_built_ins
-from advsearch.copies import copied
+from advsearch.copies import copy_value
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.models import Model
@@ -85,7 +85,7 @@ class FunctionTask(Task):
         """Return the function's values, (N,). Raises InputError if they are not
         that.
         """
-        losses = self.function(copied(output), truth)
+        losses = self.function(copy_value(output), truth)
         count = len(output)
         is_tensor = isinstance(losses, Tensor)
         if is_tensor and losses.is_floating_point() and losses.numel() == count:

@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from advsearch.extend import InputError, Model, models, stored_files, tasks
 
-MAX_REFERENCES = 10_000  # maximum number of images in a gallery, before `scaled`
+MAX_REFERENCES = 10_000  # maximum number of images in a gallery, before `scale_limit`
 # Maximum size of a loaded image in pixels; larger ones are averaged down.
 MAX_IMAGE_SIZE = 1024
 BATCH_SIZE = 16  # batch size for a network
@@ -106,9 +106,9 @@ def embed_gallery(folder: str, model: Model, *, linear: bool) -> Gallery:
             )
         paths += image_paths
         name_indices += [index] * len(image_paths)
-    limit = stored_files.scaled(MAX_REFERENCES)
+    limit = stored_files.scale_limit(MAX_REFERENCES)
     if len(paths) > limit:
-        raise stored_files.too_large(
+        raise stored_files.make_size_error(
             root, f"at most {limit:,} reference pictures", f"{len(paths):,}"
         )
     features = _embed_images(paths, model)
@@ -127,7 +127,8 @@ def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
     """Compute the features (R, D) of length 1 of the images in files, in batches."""
     images = (
         _crop_center(
-            torch.from_numpy(models.upright(path, MAX_IMAGE_SIZE)), model.input_size
+            torch.from_numpy(models.load_upright(path, MAX_IMAGE_SIZE)),
+            model.input_size,
         )
         for path in paths
     )

@@ -29,8 +29,8 @@ from typing import Any, BinaryIO
 import torch
 
 from advsearch.errors import FileFormatError
-from advsearch.trust.foreign_code import first_line
-from advsearch.trust.stored_files import parse_json, scaled, too_large
+from advsearch.trust.foreign_code import get_first_line
+from advsearch.trust.stored_files import make_size_error, parse_json, scale_limit
 
 LARGEST = 16 << 30  # bytes of a model file, and of what it unpacks to
 # bytes of a member that describes the network: JSON, source code, a pickle of names
@@ -60,12 +60,14 @@ class Archive:
         that name, it is larger than `limit`, or it is damaged.
         """
         if name not in self.members:
-            raise refused(self.path, f"has no {name!r}, so it is not complete")
+            raise make_archive_error(
+                self.path, f"has no {name!r}, so it is not complete"
+            )
         size = self.members[name].file_size
-        if size > scaled(limit):
-            raise too_large(
+        if size > scale_limit(limit):
+            raise make_size_error(
                 self.path,
-                f"{name!r} of at most {scaled(limit):,} bytes in it",
+                f"{name!r} of at most {scale_limit(limit):,} bytes in it",
                 f"{size:,}",
             )
         try:
@@ -78,7 +80,7 @@ class Archive:
             RuntimeError,
             NotImplementedError,
         ) as error:
-            raise truncated(self.path, error) from None
+            raise make_truncation_error(self.path, error) from None
 
     def read_json(self, name: str) -> Any:
         """Return the value of a member that is JSON; errors as for `read`, and where it
@@ -87,8 +89,8 @@ class Archive:
         try:
             return parse_json(self.read(name, LARGEST_TEXT))
         except ValueError as error:
-            raise refused(
-                self.path, f"expected JSON in {name!r}, got {first_line(error)}"
+            raise make_archive_error(
+                self.path, f"expected JSON in {name!r}, got {get_first_line(error)}"
             ) from None
 
 
@@ -101,19 +103,17 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
         archive = zipfile.ZipFile(file)
         entries = archive.infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-        raise truncated(path, error) from None
+        raise make_truncation_error(path, error) from None
     unpacked = sum(entry.file_size for entry in entries)
     limit = ""
-    if unpacked > scaled(LARGEST):
-        limit = f"a model of at most {scaled(LARGEST):,} bytes unpacked"
+    if unpacked > scale_limit(LARGEST):
+        limit = f"a model of at most {scale_limit(LARGEST):,} bytes unpacked"
         got = f"{unpacked:,}"
-    elif unpacked > scaled(LARGEST_RATIO) * size + SLACK:
-        limit = (
-            f"a model that unpacks to at most {scaled(LARGEST_RATIO)} times its size"
-        )
+    elif unpacked > scale_limit(LARGEST_RATIO) * size + SLACK:
+        limit = f"a model that unpacks to at most {scale_limit(LARGEST_RATIO)} times its size"
         got = f"{size:,} bytes that unpack to {unpacked:,}"
     if limit:
-        raise too_large(path, limit, got)
+        raise make_size_error(path, limit, got)
     roots = {
         entry.filename.partition("/")[0] if "/" in entry.filename else ""
         for entry in entries
@@ -121,28 +121,28 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
     root = f"{roots.pop()}/" if len(roots) == 1 and "" not in roots else ""
     members = {entry.filename.removeprefix(root): entry for entry in entries}
     if len(members) < len(entries):
-        raise refused(path, "has two members of one name")
+        raise make_archive_error(path, "has two members of one name")
     for name, entry in members.items():
         if not _NAME.fullmatch(name) or ".." in name.split("/"):
-            raise refused(path, f"has a member of the name {name[:80]!r}")
+            raise make_archive_error(path, f"has a member of the name {name[:80]!r}")
         if entry.flag_bits & 0x1 or entry.compress_type not in _METHODS:
-            raise refused(
+            raise make_archive_error(
                 path, f"has an encrypted or strangely packed member, {name[:80]!r}"
             )
     return Archive(path, archive, members)
 
 
-def refused(path: Path, what: str) -> FileFormatError:
+def make_archive_error(path: Path, what: str) -> FileFormatError:
     """Return the error for an archive with something in it that is never loaded."""
     return FileFormatError(
         f"model file {path}: {what}; export a plain network with torch.export.save"
     )
 
 
-def truncated(path: Path, error: BaseException) -> FileFormatError:
+def make_truncation_error(path: Path, error: BaseException) -> FileFormatError:
     """Return the error for an archive that cannot be unpacked."""
     return FileFormatError(
-        f"model file {path}: truncated or damaged archive ({first_line(error)})"
+        f"model file {path}: truncated or damaged archive ({get_first_line(error)})"
     )
 
 
@@ -177,7 +177,7 @@ _ITEM_BYTES = {
 }
 
 
-def rewritten_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
+def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
     """Return an archive for `torch.jit.load` that holds the code, the pickles and the
     tensors of this one, and whether torch runs a part of the code while it loads it.
     Raises FileFormatError where its code calls what a network has no use for, or its
@@ -190,12 +190,12 @@ def rewritten_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
     ]
     code = {name: archive.read(name, LARGEST_CODE) for name in scripts}
     if sum(map(len, code.values())) > LARGEST_CODE:
-        raise refused(
+        raise make_archive_error(
             archive.path, f"has more than {LARGEST_CODE:,} bytes of source code"
         )
     for name, content in code.items():
-        if wrong := _code_problem(content):
-            raise refused(
+        if wrong := _find_code_problem(content):
+            raise make_archive_error(
                 archive.path, f"{name!r} {wrong}, which no plain network does"
             )
     for name in PICKLES:
@@ -206,7 +206,7 @@ def rewritten_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
     name = "version" if "version" in archive else ".data/version"
     version = archive.read(name, 100).decode("ascii", "replace").strip()
     if not re.fullmatch("[0-9]{1,3}", version):
-        raise refused(
+        raise make_archive_error(
             archive.path, f"expected a version number in {name!r}, got {version[:20]!r}"
         )
     buffer = io.BytesIO()
@@ -220,7 +220,7 @@ def rewritten_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
     return buffer, any(b"__setstate__" in content for content in code.values())
 
 
-def _code_problem(content: bytes) -> str:
+def _find_code_problem(content: bytes) -> str:
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError:
@@ -287,15 +287,15 @@ def _check_pickle(archive: Archive, name: str) -> None:
     try:
         value = reader.load()
     except Exception as error:  # a damaged pickle raises nearly anything
-        raise refused(
-            archive.path, f"{name!r} is damaged ({first_line(error)})"
+        raise make_archive_error(
+            archive.path, f"{name!r} is damaged ({get_first_line(error)})"
         ) from None
     if any(
         family not in _CLASSES
         for text in reader.names
         for family in _CLASS.findall(text)
     ):
-        raise refused(
+        raise make_archive_error(
             archive.path, f"{name!r} holds native objects, which are never loaded"
         )
     _check_values(archive, name, value)
@@ -308,11 +308,13 @@ def _check_pickle(archive: Archive, name: str) -> None:
         key = f"{PICKLES[name]}/{parts[2]}"
         count = parts[4]
         if kind not in _ITEM_BYTES or not isinstance(count, int) or count < 0:
-            raise refused(archive.path, f"has a tensor of another kind in {key[:80]!r}")
+            raise make_archive_error(
+                archive.path, f"has a tensor of another kind in {key[:80]!r}"
+            )
         size = archive.members[key].file_size if key in archive else 0
         if count * _ITEM_BYTES[kind] > size:
             got = f"{key[:80]!r} has {size:,} bytes, but should hold {count:,} numbers"
-            raise refused(archive.path, f"is damaged: {got}")
+            raise make_archive_error(archive.path, f"is damaged: {got}")
 
 
 def _check_values(archive: Archive, name: str, value: Any) -> None:
@@ -321,7 +323,9 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
     for _ in range(DEPTH):
         signs = {sign for item in level if isinstance(item, str) for sign in item}
         if any(ord(sign) not in _WHITE and not sign.isprintable() for sign in signs):
-            raise refused(archive.path, f"{name!r} has text with hidden characters")
+            raise make_archive_error(
+                archive.path, f"{name!r} has text with hidden characters"
+            )
         # each once: a pickle may name one part any number of times
         new = dict[int, Any]()
         for outer in level:
@@ -337,7 +341,7 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
         checked_ids.update(new)
         if not level:
             return
-    raise refused(archive.path, f"{name!r} is nested deeper than {DEPTH}")
+    raise make_archive_error(archive.path, f"{name!r} is nested deeper than {DEPTH}")
 
 
 @contextlib.contextmanager

@@ -70,12 +70,12 @@ def allow_named(settings: Mapping[str, Any]) -> None:
     """
     names: list[object] = []
     for key in ("model", "compared", "than"):
-        texts = [text for text in _listed(settings.get(key)) if isinstance(text, str)]
+        texts = [text for text in _to_list(settings.get(key)) if isinstance(text, str)]
         names += [part.partition("@")[0] for text in texts for part in text.split(",")]
     for key in ("controls", "over"):
         value = settings.get(key)
         for control in (
-            *_listed(value),
+            *_to_list(value),
             *(value.values() if isinstance(value, Mapping) else ()),
         ):
             names += (
@@ -95,7 +95,7 @@ def allow_named(settings: Mapping[str, Any]) -> None:
     _ALLOWED.update(filter(_CODE.fullmatch, texts))
 
 
-def names_code(function: Function) -> Function:
+def allow_code_of_call(function: Function) -> Function:
     """Let what a caller gives a function, which is for Python only and not for what a
     file says, allow code too.
     """
@@ -111,12 +111,12 @@ def names_code(function: Function) -> Function:
     return wrapper  # type: ignore[return-value]
 
 
-def _listed(value: Any) -> list[Any]:
+def _to_list(value: Any) -> list[Any]:
     return list(value) if isinstance(value, (list, tuple, Mapping)) else [value]
 
 
 @contextmanager
-def nothing_allowed() -> Iterator[None]:
+def restrict_allowed_code() -> Iterator[None]:
     """Allow inside the block what is named there alone, and after it what was allowed
     before.
     """
@@ -129,14 +129,14 @@ def nothing_allowed() -> Iterator[None]:
         _ALLOWED.update(before)
 
 
-def may_fetch(model: str) -> bool:
+def is_fetch_allowed(model: str) -> bool:
     """Return whether a person has named a model of a library, so that its weights may
     be fetched.
     """
     return model in _ALLOWED or model.partition("@")[0] in _ALLOWED
 
 
-def how_to_allow(name: str) -> str:
+def explain_how_to_allow(name: str) -> str:
     """Return how a person allows what only a file names, for messages."""
     return (
         "if you trust it, allow it yourself: in Python with "
@@ -157,11 +157,11 @@ def check_import(name: str) -> None:
     where = f" from {spec.origin}" if spec is not None and spec.origin else ""
     raise CodeNotAllowedError(
         f"a file names {name}, Python code{where} that would be imported and run; read "
-        f"it, and {how_to_allow(name)}"
+        f"it, and {explain_how_to_allow(name)}"
     )
 
 
-OWN_FOLDER = Path(__file__).resolve().parents[2]
+SUBPROCESS_DIRECTORY = Path(__file__).resolve().parents[2]
 """Where processes of Python that we start begin: Python looks there for modules first,
 and the folder that a user is in may be somebody else's.
 """

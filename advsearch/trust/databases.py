@@ -33,7 +33,7 @@ _JOURNAL = bytes.fromhex("d9d505f920a163d7")
 
 
 @contextmanager
-def readable(path: Path) -> Iterator[None]:
+def translate_database_errors(path: Path) -> Iterator[None]:
     """Turn what SQLite says of a damaged file inside the block into an error that names
     it.
     """
@@ -75,12 +75,12 @@ def read_schema(db: sqlite3.Connection) -> Counter[Any]:
         "SELECT type, name, tbl_name, sql FROM sqlite_master"
     ).fetchmany(MAX_SCHEMA_ENTRIES)
     return Counter(
-        (*names, None if sql is None else _without_comments(str(sql)))
+        (*names, None if sql is None else _strip_comments(str(sql)))
         for *names, sql in entries
     )
 
 
-def _without_comments(statement: str) -> str:
+def _strip_comments(statement: str) -> str:
     without_comments = "\n".join(
         line.partition("--")[0] for line in statement.split("\n")
     )

@@ -24,7 +24,12 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.files import JsonObject, JsonValue
-from advsearch.trust.archives import LARGEST_TEXT, Archive, open_archive, refused
+from advsearch.trust.archives import (
+    LARGEST_TEXT,
+    Archive,
+    make_archive_error,
+    open_archive,
+)
 from advsearch.trust.stored_files import parse_json
 
 LENGTH = 20_000  # characters of an expression
@@ -259,7 +264,7 @@ _CONTAINERS = frozenset(
 _FORGOTTEN: JsonObject = {"metadata": {}, "guards_code": []}
 
 
-def rewritten(archive: Archive) -> io.BytesIO:
+def rewrite_program(archive: Archive) -> io.BytesIO:
     """Return an archive for `torch.export.load` that holds what is harmless of this
     one: the network and its weights. Raises FileFormatError where it has something in
     it that a plain network has not; the message says what.
@@ -273,8 +278,10 @@ def rewritten(archive: Archive) -> io.BytesIO:
         program.get("graph_module"), dict
     ):
         expected = f"expected a network in {names[PROGRAM]!r}, got other JSON"
-        raise refused(archive.path, f"cannot be read as torch.export ({expected})")
-    program = _checked(archive.path, program, "")
+        raise make_archive_error(
+            archive.path, f"cannot be read as torch.export ({expected})"
+        )
+    program = _check_value(archive.path, program, "")
     for name in EXAMPLE:
         if name in archive:
             _check_pickle(archive, name)
@@ -304,17 +311,17 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
     if not isinstance(table, dict) or not all(
         isinstance(entry, dict) for entry in table.values()
     ):
-        raise refused(
+        raise make_archive_error(
             archive.path,
             f"expected a table of tensors in {config!r}, got something else",
         )
-    table = _checked(archive.path, table, "tensor_name")
+    table = _check_value(archive.path, table, "tensor_name")
     copied: set[str] = set()
     for name, entry in table.items():
         record = entry.get("path_name") if isinstance(entry, dict) else None
         plain = isinstance(record, str) and _RECORD.fullmatch(record)
         if not isinstance(entry, dict) or entry.get("use_pickle") or not plain:
-            raise refused(
+            raise make_archive_error(
                 archive.path,
                 f"{name[:80]!r} is a pickled object or "
                 "compiled code, which is never loaded",
@@ -327,7 +334,7 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
             size.get("as_int") if isinstance(size, dict) else None for size in listed
         ]
         if not all(isinstance(number, int) and number >= 0 for number in numbers):
-            raise refused(
+            raise make_archive_error(
                 archive.path,
                 "expected the sizes of a tensor for "
                 f"{member[:80]!r}, got something else",
@@ -338,7 +345,7 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
             and archive.members[member].file_size == 0
             and math.prod(numbers) > 0
         ):
-            raise refused(
+            raise make_archive_error(
                 archive.path,
                 f"{member[:80]!r} is empty, but should hold a tensor of {numbers[:8]}",
             )
@@ -352,15 +359,15 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
 # --------------------------------------------------------------------------------
 
 
-def _checked(path: Path, value: JsonValue, key: str) -> Any:
+def _check_value(path: Path, value: JsonValue, key: str) -> Any:
     """Return a value of the description, which stands under `key`, without what is left
     out.
     """
     if isinstance(value, list):
-        return [_checked(path, inner, key) for inner in value]
+        return [_check_value(path, inner, key) for inner in value]
     if not isinstance(value, dict):
         if wrong := _problem(value, key):
-            raise refused(path, wrong)
+            raise make_archive_error(path, wrong)
         return value
     checked: JsonObject = {}
     for name, inner in value.items():
@@ -370,9 +377,9 @@ def _checked(path: Path, value: JsonValue, key: str) -> Any:
         ):
             wrong = "holds a custom object, which is never loaded"
         if wrong:
-            raise refused(path, wrong)
+            raise make_archive_error(path, wrong)
         checked[name] = (
-            _FORGOTTEN[name] if name in _FORGOTTEN else _checked(path, inner, name)
+            _FORGOTTEN[name] if name in _FORGOTTEN else _check_value(path, inner, name)
         )
     return checked
 
@@ -491,11 +498,11 @@ def _check_pickle(archive: Archive, name: str) -> None:
         else None
     )
     if inner is None or "data.pkl" not in inner:
-        raise refused(archive.path, what)
+        raise make_archive_error(archive.path, what)
     try:
         steps = list(pickletools.genops(inner.read("data.pkl", LARGEST_TEXT)))
     except (ValueError, IndexError, UnicodeDecodeError):
-        raise refused(archive.path, what) from None
+        raise make_archive_error(archive.path, what) from None
     for step, argument, _ in steps:
         foreign = step.name == "GLOBAL" and not _GLOBALS.fullmatch(str(argument))
         if foreign or step.name in (
@@ -506,4 +513,4 @@ def _check_pickle(archive: Archive, name: str) -> None:
             "EXT2",
             "EXT4",
         ):
-            raise refused(archive.path, what)
+            raise make_archive_error(archive.path, what)

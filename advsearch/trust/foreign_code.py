@@ -27,8 +27,8 @@ import torch
 from torch import nn
 
 from advsearch.errors import AdvsearchError, ModelError
-from advsearch.trust.code import OWN_FOLDER
-from advsearch.trust.stored_files import FACTOR, scaled
+from advsearch.trust.code import SUBPROCESS_DIRECTORY
+from advsearch.trust.stored_files import FACTOR, scale_limit
 
 # seconds that a file's first passes may take each, and its loading, where that runs a
 # part of it
@@ -43,18 +43,18 @@ _TRIAL = (
 Result = TypeVar("Result")
 
 
-class TookTooLong(Exception):
+class TimedOut(Exception):
     """The time was up; the message says what the limit is and how it is raised."""
 
     def __init__(self) -> None:
         super().__init__(
-            f"no answer within {scaled(LONGEST)} seconds; if you trust it, {FACTOR}=10 "
+            f"no answer within {scale_limit(LONGEST)} seconds; if you trust it, {FACTOR}=10 "
             "in the environment "
             "waits ten times as long"
         )
 
 
-def within(
+def run_within_limits(
     call: Callable[[], Result], stop: Callable[[], None] | None = None
 ) -> Result:
     """Return what `call`, which may never end, returns, or raise what it raises; `stop`
@@ -74,12 +74,12 @@ def within(
     # a daemon's: the process may end before it
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
-    thread.join(scaled(LONGEST))
+    thread.join(scale_limit(LONGEST))
     if thread.is_alive():
         if stop is not None:
             stop()
             thread.join(GRACE)
-        raise TookTooLong
+        raise TimedOut
     return outcome.result()
 
 
@@ -94,11 +94,11 @@ def try_torchscript(archive: io.BytesIO) -> str:
             command,
             input=archive.getbuffer(),
             capture_output=True,
-            timeout=scaled(LONGEST),
-            cwd=OWN_FOLDER,
+            timeout=scale_limit(LONGEST),
+            cwd=SUBPROCESS_DIRECTORY,
         )
     except subprocess.TimeoutExpired:
-        return str(TookTooLong())
+        return str(TimedOut())
     return (
         f"torch crashed while loading it (signal {-done.returncode})"
         if done.returncode < 0
@@ -120,7 +120,7 @@ class Switches:
     anomalies: bool = False
 
     @classmethod
-    def now(cls) -> Switches:
+    def read_current(cls) -> Switches:
         """Return them as they are."""
         new = torch.get_default_dtype(), torch.get_default_device()
         return cls(
@@ -130,14 +130,14 @@ class Switches:
             torch.is_anomaly_enabled(),
         )
 
-    def turn(self) -> None:
+    def apply(self) -> None:
         """Turn all of them."""
-        self.turn_for_new_tensors()
+        self.apply_to_new_tensors()
         torch.set_grad_enabled(self.gradients)
         torch.set_deterministic_debug_mode(self.deterministic)
         torch.autograd.set_detect_anomaly(self.anomalies)
 
-    def turn_for_new_tensors(self) -> None:
+    def apply_to_new_tensors(self) -> None:
         """Turn those for new tensors."""
         torch.set_default_dtype(self.dtype)
         if torch.get_default_device() != self.device:
@@ -146,11 +146,11 @@ class Switches:
 
 PLAIN = Switches()
 
-_outside: list[Switches] = []  # as `plainly` found them, the outermost first
+_outside: list[Switches] = []  # as `use_plain_switches` found them, the outermost first
 
 
 @contextmanager
-def plainly() -> Iterator[None]:
+def use_plain_switches() -> Iterator[None]:
     """Turn torch's switches as it comes, and back at the end: also out of
     `torch.inference_mode`.
     """
@@ -159,30 +159,30 @@ def plainly() -> Iterator[None]:
         if torch.is_inference_mode_enabled()
         else nullcontext()
     ):
-        before = Switches.now()
+        before = Switches.read_current()
         _outside.append(before)
         if before != PLAIN:
-            PLAIN.turn()
+            PLAIN.apply()
         try:
             yield
         finally:
             _outside.pop()
-            if Switches.now() != before:
-                before.turn()
+            if Switches.read_current() != before:
+                before.apply()
 
 
-def turned_by_code() -> Switches:
+def find_code_switches() -> Switches:
     """Return the switches as the code of a network has turned them just now, or had
     before; they are `PLAIN` then.
     """
-    turned = Switches.now()
+    turned = Switches.read_current()
     if turned == PLAIN:
         return _outside[0] if _outside else PLAIN
-    PLAIN.turn()
+    PLAIN.apply()
     return turned
 
 
-def called_under(module: nn.Module, switches: Switches) -> None:
+def call_with_switches(module: nn.Module, switches: Switches) -> None:
     """Have a module called with switches of its own for new tensors, and those of the
     caller afterwards.
     """
@@ -191,17 +191,17 @@ def called_under(module: nn.Module, switches: Switches) -> None:
     before: list[Switches] = []
 
     def enter(*_: Any) -> None:
-        before.append(Switches.now())
-        switches.turn_for_new_tensors()
+        before.append(Switches.read_current())
+        switches.apply_to_new_tensors()
 
     def leave(*_: Any) -> None:
-        before.pop().turn_for_new_tensors()
+        before.pop().apply_to_new_tensors()
 
     module.register_forward_pre_hook(enter)
     module.register_forward_hook(leave, always_call=True)
 
 
-def first_line(error: BaseException) -> str:
+def get_first_line(error: BaseException) -> str:
     """Return a foreign error as one short line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     lines = [
@@ -213,7 +213,9 @@ def first_line(error: BaseException) -> str:
 
 
 @contextmanager
-def foreign(what: str, kind: type[AdvsearchError] = ModelError) -> Iterator[None]:
+def translate_errors(
+    what: str, kind: type[AdvsearchError] = ModelError
+) -> Iterator[None]:
     """Turn what code of others raises inside the block, which may be anything, into an
     error: what failed, and the foreign error. One of ours is left as it is.
     """
@@ -222,4 +224,4 @@ def foreign(what: str, kind: type[AdvsearchError] = ModelError) -> Iterator[None
     except AdvsearchError:
         raise
     except Exception as error:
-        raise kind(f"{what} ({first_line(error)})") from error
+        raise kind(f"{what} ({get_first_line(error)})") from error

@@ -26,7 +26,7 @@ OUTSIDE = "is outside its folder and is not read"
 _NO_SUCH_NAME = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EINVAL)
 
 
-def plain_name(name: str) -> str:
+def normalize_name(name: str) -> str:
     """Return a file name as it is written on this system: no quotes, no percent signs,
     forward slashes.
     """
@@ -40,7 +40,7 @@ def is_inside(path: Path | str, folder: Path | str) -> bool:
 
 class References:
     """Finds the files that a mesh file names. `refused` are those that it could not
-    get, as `plain_name` gives them, and why: `MISSING`, `OUTSIDE` or another clause.
+    get, as `normalize_name` gives them, and why: `MISSING`, `OUTSIDE` or another clause.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,18 +54,18 @@ class References:
         distortions are tried. Raises FileNotFoundError: it is not there, or must not be
         read; `refused` says which.
         """
-        content = self.tried(name)
+        content = self.find(name)
         if isinstance(content, bytes):
             return content
-        self.refused[plain_name(name)] = content
+        self.refused[normalize_name(name)] = content
         raise FileNotFoundError(name)
 
-    def tried(self, name: str) -> bytes | str:
+    def find(self, name: str) -> bytes | str:
         """Return the content of a named file, or why it is not read, which is not
         remembered.
         """
         reason = MISSING
-        spellings = (name.strip(), plain_name(name))
+        spellings = (name.strip(), normalize_name(name))
         forms = [
             form
             for text in spellings

@@ -105,7 +105,7 @@ class NoRedirect(urllib.request.HTTPRedirectHandler):
 DAYS = 7  # for which a certificate is good
 
 
-def https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
+def make_https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
     """Return what speaks HTTPS under some names and addresses, and the SHA-256
     fingerprint of its new certificate. Raises InputError where there is no `openssl`,
     or it makes none.
@@ -185,7 +185,7 @@ def is_address(host: str) -> bool:
 
 
 @contextlib.contextmanager
-def connecting(allowed: bool, tries: list[object]) -> Iterator[None]:
+def restrict_connections(allowed: bool, tries: list[object]) -> Iterator[None]:
     """Let this thread connect to nobody inside the block, unless that is allowed; each
     try is noted in `tries`.
     """

@@ -38,7 +38,7 @@ CLOSED = {
 """Headers of every answer, beside its `Content-Security-Policy`."""
 
 
-class Refused(Exception):
+class RequestRejected(Exception):
     """A request that is not answered as asked."""
 
     def __init__(self, status: HTTPStatus, text: str) -> None:
@@ -68,22 +68,24 @@ def check_request(
             machine alone.
     """
     if len(path) > LONGEST:
-        raise Refused(HTTPStatus.REQUEST_URI_TOO_LONG, "the address is too long")
+        raise RequestRejected(
+            HTTPStatus.REQUEST_URI_TOO_LONG, "the address is too long"
+        )
     host = headers.get("Host", "")
-    if not _is_own(host, named, port, token):
-        raise Refused(
+    if not _is_server_address(host, named, port, token):
+        raise RequestRejected(
             HTTPStatus.FORBIDDEN,
             "this server is not called so; open the address that it printed",
         )
     origin = headers.get("Origin")
     if origin is not None and origin != f"{scheme}://{host}":
-        raise Refused(
+        raise RequestRejected(
             HTTPStatus.FORBIDDEN,
             "a page of another origin asks; open the address that was printed",
         )
     if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
         if headers.get("Sec-Fetch-Mode") != "navigate" or command == "POST":
-            raise Refused(HTTPStatus.FORBIDDEN, "a page of another site asks")
+            raise RequestRejected(HTTPStatus.FORBIDDEN, "a page of another site asks")
     if token is not None:
         tokens = parse_qs(urlsplit(path).query).get("token", [])
         for part in headers.get("Cookie", "").split(";"):
@@ -95,13 +97,13 @@ def check_request(
             for candidate in tokens
             if candidate.isascii()
         ):
-            raise Refused(
+            raise RequestRejected(
                 HTTPStatus.UNAUTHORIZED,
                 "the token is missing; open the address that was printed",
             )
 
 
-def _is_own(host: str, named: str, port: int, token: str | None) -> bool:
+def _is_server_address(host: str, named: str, port: int, token: str | None) -> bool:
     """Whether a request's Host is an address of this server: a name would need a name
     server to lead here.
     """
@@ -115,19 +117,19 @@ def _is_own(host: str, named: str, port: int, token: str | None) -> bool:
     )
 
 
-def token_cookie(port: int, token: str) -> str:
+def make_token_cookie(port: int, token: str) -> str:
     """Return what a browser keeps so that links need no token. It is lax: a link on the
     page of a run, which has an origin of its own, leads back to the list.
     """
     return f"{COOKIE}-{port}={token}; HttpOnly; Secure; SameSite=Lax; Path=/"
 
 
-def script_digest(code: bytes) -> str:
+def compute_script_digest(code: bytes) -> str:
     """Return a script's SHA-256 as a policy names it."""
     return base64.b64encode(hashlib.sha256(code).digest()).decode()
 
 
-def page_policy(digests: Iterable[str], *, connects: bool) -> str:
+def make_page_policy(digests: Iterable[str], *, connects: bool) -> str:
     """Return what a page may load and run; `digests` are those of its scripts."""
     images, connect = (
         ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
@@ -140,7 +142,7 @@ def page_policy(digests: Iterable[str], *, connects: bool) -> str:
     )
 
 
-def served_policy(digests: Iterable[str], *, own: bool) -> str:
+def make_served_policy(digests: Iterable[str], *, is_generated: bool) -> str:
     """Return the `Content-Security-Policy` that a server sends; `digests` are those of
     all our scripts. A page that it has made itself may ask its server for more. All
     else lies in the folder of a run, which may be somebody else's: it gets an origin of
@@ -150,8 +152,8 @@ def served_policy(digests: Iterable[str], *, own: bool) -> str:
         "form-action 'none'; sandbox allow-scripts allow-popups "
         "allow-popups-to-escape-sandbox"
     )
-    closed = "form-action 'self'" if own else sandbox
-    return f"{page_policy(digests, connects=own)}; frame-ancestors 'none'; {closed}"
+    closed = "form-action 'self'" if is_generated else sandbox
+    return f"{make_page_policy(digests, connects=is_generated)}; frame-ancestors 'none'; {closed}"
 
 
 def has_other_scripts(page: bytes, digests: Collection[str]) -> bool:
@@ -168,6 +170,6 @@ def has_other_scripts(page: bytes, digests: Collection[str]) -> bool:
         close = re.compile(rb"</script", re.IGNORECASE).search(page, begin)
         end = close.start() if close else len(page)
         is_data = page.startswith(b' type="application/', opening.end())
-        if not is_data and script_digest(page[begin:end]) not in digests:
+        if not is_data and compute_script_digest(page[begin:end]) not in digests:
             return True
     return False

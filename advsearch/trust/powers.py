@@ -17,7 +17,7 @@ import shlex
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from advsearch.threads import cores
+from advsearch.threads import count_cores
 
 Power = Callable[[Any], str]
 """What a value of a setting does beyond the run, in words that follow its name; empty
@@ -25,16 +25,16 @@ where it does nothing there.
 """
 
 
-def none(value: Any) -> str:
+def no_power(value: Any) -> str:
     """Of a setting that decides what happens in its run alone."""
     return ""
 
 
-def many_processes(count: int | None) -> str:
+def describe_processes(count: int | None) -> str:
     """Of a number of processes; as many as there are processors are no more than a run
     takes anyway.
     """
-    n_processors = cores()
+    n_processors = count_cores()
     return (
         ""
         if count is None or count <= n_processors
@@ -42,42 +42,42 @@ def many_processes(count: int | None) -> str:
     )
 
 
-def connection(place: str | None) -> str:
+def describe_connection(address: str | None) -> str:
     """Of where workers are."""
     return (
         ""
-        if place in (None, "local")
-        else (f"connects to {place}, and what answers there can run code here")
+        if address in (None, "local")
+        else (f"connects to {address}, and what answers there can run code here")
     )
 
 
-def tracker(name: str | None) -> str:
+def describe_tracker(name: str | None) -> str:
     """Of an experiment tracker; TensorBoard's files lie in the run."""
     return "" if name in (None, "tensorboard") else f"sends every evaluation to {name}"
 
 
-def place(run: str | None) -> str:
+def describe_location(run: str | None) -> str:
     """Of where a run is kept; a name is one in runs/."""
     inside = run is None or (os.sep not in run and run not in (".", ".."))
     return "" if inside else f"writes into {run}, outside of runs/"
 
 
-def replacing(wanted: bool) -> str:
+def describe_overwrite(wanted: bool) -> str:
     """Of what replaces a run."""
     return "deletes the run that is there" if wanted else ""
 
 
-def file(path: str | None) -> str:
+def describe_file(path: str | None) -> str:
     """Of a file or folder to write."""
     return "" if path is None else f"writes {path}"
 
 
-def beside_suite(wanted: str | bool | None) -> str:
+def describe_suite_change(wanted: str | bool | None) -> str:
     """Of what changes what lies beside a suite."""
     return "changes what is kept beside the suite" if wanted else ""
 
 
-class LeftOut(NamedTuple):
+class OmittedSetting(NamedTuple):
     """A setting of a file with power over more than its run: name, field, value, what
     that does, and the default.
     """
@@ -85,11 +85,11 @@ class LeftOut(NamedTuple):
     name: str
     field: str
     value: Any
-    does: str
+    effect: str
     default: Any
 
     @property
-    def ask(self) -> str:
+    def how_to_set(self) -> str:
         """How a person asks for it, and how to do without, as both are typed behind a
         file or a run.
         """

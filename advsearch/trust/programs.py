@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from advsearch.errors import FileFormatError
-from advsearch.trust.stored_files import FACTOR, scaled
+from advsearch.trust.stored_files import FACTOR, scale_limit
 
 
 def run_converter(
@@ -32,9 +32,9 @@ def run_converter(
 ) -> subprocess.CompletedProcess[str]:
     """Run a program that makes glTF of the file at `path`, in a folder, and return what
     it said. Raises OSError: it can't be started; FileFormatError: it takes longer than
-    so many seconds, before `scaled`.
+    so many seconds, before `scale_limit`.
     """
-    longest = scaled(seconds)
+    longest = scale_limit(seconds)
     unread = subprocess.DEVNULL
     try:
         return subprocess.run(
@@ -55,7 +55,7 @@ def run_converter(
         ) from None
 
 
-def surroundings(folder: str) -> dict[str, str]:
+def make_environment(folder: str) -> dict[str, str]:
     """Return the environment of a process that has a folder for its home, and nothing
     of ours but the path.
     """

@@ -45,8 +45,8 @@ _OPENED: dict[str, dict[str, None]] = {}
 
 
 @contextmanager
-def reading(path: Path | str) -> Iterator[None]:
-    """Files that are opened inside are parts of this one (see `opened_for`), unless it
+def track_opened_files(path: Path | str) -> Iterator[None]:
+    """Files that are opened inside are parts of this one (see `list_opened_files`), unless it
     is part of another itself.
     """
     token = _ROOT.set(_ROOT.get() or os.path.abspath(path))
@@ -56,20 +56,20 @@ def reading(path: Path | str) -> Iterator[None]:
         _ROOT.reset(token)
 
 
-def note_opened(path: Path | str) -> None:
+def record_opened(path: Path | str) -> None:
     """Remember that a file was read; `open_regular` does it itself."""
     absolute_path = os.path.abspath(path)
     _OPENED.setdefault(_ROOT.get() or absolute_path, {})[absolute_path] = None
 
 
-def opened_for(path: Path | str) -> list[str]:
+def list_opened_files(path: Path | str) -> list[str]:
     """Return the files that this process has read for a file: itself, and what it
     names, in order, by full path.
     """
     return list(_OPENED.get(os.path.abspath(path), {}))
 
 
-def scaled(limit: int) -> int:
+def scale_limit(limit: int) -> int:
     """Return a limit on the size of input (bytes, pixels, faces, ...) times
     `ADVSEARCH_LIMITS`, which is 1 by default. Raises InputError where
     `ADVSEARCH_LIMITS` is not a number greater than 0.
@@ -87,7 +87,7 @@ def scaled(limit: int) -> int:
     return int(limit * factor)
 
 
-def too_large(path: Path | str, expected: str, size: str) -> FileFormatError:
+def make_size_error(path: Path | str, expected: str, size: str) -> FileFormatError:
     """Return the error for input over a limit, which names what raises it: "a mesh of
     at most 100 faces", "120".
     """
@@ -101,7 +101,7 @@ def too_large(path: Path | str, expected: str, size: str) -> FileFormatError:
 def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
     """Return an ordinary file, such as ``"a label file"``, opened for reading; close
     it. Links are followed. Raises FileFormatError: a directory, a pipe, a socket or a
-    device, none of which is read; or more bytes than the limit, which is `scaled`.
+    device, none of which is read; or more bytes than the limit, which is `scale_limit`.
     Raises OSError as `open`: it is not there, or there is no permission.
     """
     if "\0" in str(path):
@@ -118,7 +118,7 @@ def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
     except BaseException:
         os.close(descriptor)
         raise
-    note_opened(path)
+    record_opened(path)
     return file
 
 
@@ -126,7 +126,7 @@ def read_bytes(path: Path, expected: str, limit: int) -> bytes:
     """Return the content of an ordinary file; arguments and errors as for
     `open_regular`.
     """
-    most = scaled(limit)
+    most = scale_limit(limit)
     with open_regular(path, expected, limit) as file:
         data = file.read(most + 1)  # a file may grow, and those of /proc give no size
     if data is None:  # the kernel's log is such a file
@@ -135,7 +135,7 @@ def read_bytes(path: Path, expected: str, limit: int) -> bytes:
             "an ordinary file"
         )
     if len(data) > most:
-        raise too_large(path, f"{expected} of at most {most:,} bytes", "more")
+        raise make_size_error(path, f"{expected} of at most {most:,} bytes", "more")
     return data
 
 
@@ -152,7 +152,7 @@ def read_text(path: Path, expected: str, limit: int) -> str:
         ) from None
 
 
-def present_text(path: Path | str, expected: str, limit: int) -> str:
+def read_existing_text(path: Path | str, expected: str, limit: int) -> str:
     """Return what `read_text` returns, and raise FileFormatError where it raises
     OSError, too.
     """
@@ -164,7 +164,9 @@ def present_text(path: Path | str, expected: str, limit: int) -> str:
         ) from None
 
 
-def parsed(path: Path | str, text: str, kind: str, parse: Callable[[str], Any]) -> Any:
+def parse_text(
+    path: Path | str, text: str, kind: str, parse: Callable[[str], Any]
+) -> Any:
     """Return what the text of a file says. Raises FileFormatError where it is not of
     its kind, such as "JSON".
     """
@@ -185,10 +187,10 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
     nested deeper than `DEPTH`, or has a number of thousands of digits; with `finite`
     also where one is NaN or infinite. The message is short.
     """
-    number = _finite if finite else None
+    number = _parse_finite if finite else None
     try:
         value = json.loads(
-            text, parse_int=_whole_number, parse_float=number, parse_constant=number
+            text, parse_int=_parse_integer, parse_float=number, parse_constant=number
         )
     except RecursionError:
         raise JsonBoundsError(f"lists or objects nested deeper than {DEPTH}") from None
@@ -207,13 +209,13 @@ def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
     return levels >= 0 and all(is_shallow(child, levels - 1) for child in children)
 
 
-def _whole_number(text: str) -> int:
+def _parse_integer(text: str) -> int:
     if len(text) > DIGITS:
         raise JsonBoundsError(f"a whole number of {len(text)} digits")
     return int(text)
 
 
-def _finite(text: str) -> float:
+def _parse_finite(text: str) -> float:
     if not math.isfinite(number := float(text)):
         raise ValueError(f"the number {text[:40]}")
     return number
@@ -226,15 +228,15 @@ def _check(path: Path, status: os.stat_result, expected: str, limit: int) -> Non
             "something else",
         )
         raise FileFormatError(f"{path}: expected {expected}, got {got}")
-    if status.st_size > scaled(limit):
-        raise too_large(
+    if status.st_size > scale_limit(limit):
+        raise make_size_error(
             path,
-            f"{expected} of at most {scaled(limit):,} bytes",
+            f"{expected} of at most {scale_limit(limit):,} bytes",
             f"{status.st_size:,}",
         )
 
 
-# bytes that a mesh, a texture or an environment may have, before `scaled`
+# bytes that a mesh, a texture or an environment may have, before `scale_limit`
 LARGEST_FILE = 1 << 29
 
 
@@ -242,10 +244,10 @@ def check_most(
     path: Path | str, count: int, limit: int, expected: str, got: str | None = None
 ) -> None:
     """Raise FileFormatError where a file has more of something than a limit, before
-    `scaled`; what was expected has {} in the place of that, and what it got is the
+    `scale_limit`; what was expected has {} in the place of that, and what it got is the
     count by itself.
     """
-    if count > (most := scaled(limit)):
-        raise too_large(
+    if count > (most := scale_limit(limit)):
+        raise make_size_error(
             path, expected.format(f"{most:,}"), f"{count:,}" if got is None else got
         )

@@ -55,7 +55,7 @@ def storage_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
-        check_there(path)
+        check_not_moved(path)
         if isinstance(error, OSError):
             known = _ADVICE.get(error.errno or 0)
             text = str(error.strerror or error)
@@ -70,7 +70,7 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def placed_by(setting: str) -> Iterator[None]:
+def name_setting_in_errors(setting: str) -> Iterator[None]:
     """Let the advice of a `StorageError` inside the block name the setting that says
     where the file goes.
     """
@@ -81,14 +81,14 @@ def placed_by(setting: str) -> Iterator[None]:
 
 
 @contextmanager
-def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
+def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Yield a path to write to; when the block ends well its file takes the place of
     `path` in one step. When it raises, or the process is killed, `path` is as it was
     before. Missing folders are made. A `durable` file survives a power cut; that takes
     some 10 ms.
     """
     part = path.with_name(f"{PART}{os.getpid()}-{path.name}")
-    check_there(path)  # or missing folders would be made
+    check_not_moved(path)  # or missing folders would be made
     try:
         with storage_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -122,16 +122,16 @@ def check_free_folder(out: Path, setting: str) -> None:
 
 def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> Path:
     """Write `data` to `path`, whole or not at all, and return the path; `durable` as
-    for `replacing`.
+    for `replace_file`.
     """
-    with replacing(path, durable=durable) as part:
+    with replace_file(path, durable=durable) as part:
         part.write_bytes(data)
     return path
 
 
 def write_text(path: Path, text: str, *, durable: bool = True) -> Path:
     """Write `text` in UTF-8 to `path`, whole or not at all, and return the path;
-    `durable` as for `replacing`.
+    `durable` as for `replace_file`.
     """
     return write_bytes(path, text.encode("utf-8"), durable=durable)
 
@@ -151,7 +151,7 @@ are.
 
 
 def note_open(results: Path) -> Callable[[], None]:
-    """Note that the results of a run are open for writing, for `check_there`; return
+    """Note that the results of a run are open for writing, for `check_not_moved`; return
     what notes that they are not.
     """
     with storage_errors(results):
@@ -165,7 +165,7 @@ def note_open(results: Path) -> Callable[[], None]:
     return closed
 
 
-def check_there(path: Path) -> None:
+def check_not_moved(path: Path) -> None:
     """Check that a path does not lie in the folder of a run that is written to here and
     was removed or renamed since: what is open is still written then, but to nowhere.
     Raises StorageError.
@@ -252,11 +252,11 @@ def is_held(folder: Path) -> bool:
     return False
 
 
-def check_no_links(run: Path, contents: Collection[str], unread: str) -> None:
+def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) -> None:
     """Check that what a run's folder has is its own: one that somebody else made may
     link to any file, which would be shown, copied or overwritten. The folder itself may
     be reached by a link. Looked at are the lock and its `contents`, by name, without
-    what is in folders whose path ends in `unread`. Raises FileFormatError.
+    what is in folders whose path ends in `unchecked_suffix`. Raises FileFormatError.
     """
     folders = [str(run)]
     while folders:
@@ -281,7 +281,7 @@ def check_no_links(run: Path, contents: Collection[str], unread: str) -> None:
                     "this run, got a link; remove it"
                 )
             if entry.is_dir(follow_symlinks=False):
-                if not folder.endswith(unread):
+                if not folder.endswith(unchecked_suffix):
                     folders.append(entry.path)
             elif not entry.is_file(follow_symlinks=False) and entry.name != LOCK:
                 raise FileFormatError(

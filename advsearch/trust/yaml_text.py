@@ -13,11 +13,11 @@ from typing import Any
 
 import yaml
 
-from advsearch.trust.stored_files import DEPTH, DIGITS, scaled
+from advsearch.trust.stored_files import DEPTH, DIGITS, scale_limit
 
-LARGEST = 1 << 17  # most bytes of a YAML file
+MAX_YAML_BYTES = 1 << 17  # most bytes of a YAML file
 # most values of a YAML text, those that an alias repeats counted again
-MOST_VALUES = 100_000
+MAX_VALUES = 100_000
 _PLAIN = frozenset(
     f"tag:yaml.org,2002:{kind}"
     for kind in "str int float bool null seq map merge".split()
@@ -76,7 +76,7 @@ def parse_yaml(text: str) -> Any:
     large or nested too deeply, or holds something else than settings are made of; the
     message is short.
     """
-    if len(text) > scaled(LARGEST):
+    if len(text) > scale_limit(MAX_YAML_BYTES):
         raise ValueError(f"a text of {len(text):,} characters")
     try:
         return yaml.load(text, _Loader)
@@ -135,8 +135,8 @@ def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
         total = 1
         for part in children:
             total += _check(part, depth + 1, counts)
-            if total > MOST_VALUES:
-                raise _problem(node, f"more than {MOST_VALUES:,} values")
+            if total > MAX_VALUES:
+                raise _problem(node, f"more than {MAX_VALUES:,} values")
         counts[id(node)] = total
     return counts[id(node)]
 

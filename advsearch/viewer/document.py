@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 from advsearch.files import MESHES
 from advsearch.report import wording
-from advsearch.report.views import Html, element, join_html
+from advsearch.report.views import Html, join_html, make_element
 from advsearch.runs.directory import PARTS, REPORT
 from advsearch.trust import pages
 from advsearch.version import __version__
@@ -66,30 +66,32 @@ def make_document(
         footer: a sentence at the end, by default the title.
     """
     code = _join_scripts(scripts)
-    digests = [pages.script_digest(code.encode())] if code else []
-    policy = pages.page_policy(digests, connects=connects)
-    head = element(
+    digests = [pages.compute_script_digest(code.encode())] if code else []
+    policy = pages.make_page_policy(digests, connects=connects)
+    head = make_element(
         "head",
-        element("meta", charset="utf-8"),
-        element(
+        make_element("meta", charset="utf-8"),
+        make_element(
             "meta",
             http_equiv="Content-Security-Policy",
             content=f"{policy}; form-action 'self'",
         ),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("meta", name="color-scheme", content="light dark"),
-        element("title", f"{title} - advsearch"),
-        element("link", rel="icon", href="data:,"),
-        element(
+        make_element(
+            "meta", name="viewport", content="width=device-width, initial-scale=1"
+        ),
+        make_element("meta", name="color-scheme", content="light dark"),
+        make_element("title", f"{title} - advsearch"),
+        make_element("link", rel="icon", href="data:,"),
+        make_element(
             "style", Html(f"\n{read_asset('document.css')}{read_asset('viewer.css')}")
         ),
     )
-    footer_html = element("footer", f"advsearch {__version__}, {footer or title}")
+    footer_html = make_element("footer", f"advsearch {__version__}, {footer or title}")
     # no line break between a number and its percent sign
     text = re.sub(r"(\d) %", r"\1&nbsp;%", join_html(*body, footer_html))
     content = Html(text + join_html(*data))
-    script = element("script", Html(code)) if code else None
-    page = element("html", head, element("body", content, script), lang="en")
+    script = make_element("script", Html(code)) if code else None
+    page = make_element("html", head, make_element("body", content, script), lang="en")
     return f"<!doctype html>\n{page}\n"
 
 
@@ -106,14 +108,15 @@ def _join_scripts(scripts: Sequence[str]) -> str:
 def _script_digests() -> frozenset[str]:
     """Return the digests of all scripts that pages of this version have."""
     return frozenset(
-        pages.script_digest(_join_scripts(scripts).encode()) for scripts in SCRIPTS
+        pages.compute_script_digest(_join_scripts(scripts).encode())
+        for scripts in SCRIPTS
     )
 
 
 def has_other_scripts(page: bytes) -> bool:
     """Return whether a page has a script that is none of `SCRIPTS`.
 
-    Such a script, as of another version, does not run under `served_policy`. Scripts
+    Such a script, as of another version, does not run under `make_served_policy`. Scripts
     that are data do not count.
     """
     return pages.has_other_scripts(page, _script_digests())
@@ -121,7 +124,7 @@ def has_other_scripts(page: bytes) -> bool:
 
 def served_policy(*, is_trusted: bool) -> str:
     """Return the `Content-Security-Policy` that a server sends: only `SCRIPTS` run."""
-    return pages.served_policy(_script_digests(), own=is_trusted)
+    return pages.make_served_policy(_script_digests(), is_generated=is_trusted)
 
 
 def quote_name(name: str) -> str:
@@ -137,7 +140,7 @@ def make_data_script(value: object, name: str) -> Html:
         .replace(">", "\\u003e")
         .replace("&", "\\u0026")
     )
-    return element("script", Html(text), type="application/json", id=name)
+    return make_element("script", Html(text), type="application/json", id=name)
 
 
 def make_data_url(data: bytes, media_type: str) -> str:
@@ -147,7 +150,7 @@ def make_data_url(data: bytes, media_type: str) -> str:
 
 def make_scrollable(inside: Html | None, css: str = "") -> Html:
     """Wrap an element so that it scrolls sideways if it is too wide, also by keys."""
-    return element("div", inside, class_=f"scroll {css}".strip(), tabindex="0")
+    return make_element("div", inside, class_=f"scroll {css}".strip(), tabindex="0")
 
 
 @cache
@@ -162,10 +165,10 @@ def make_header(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
     """Return the header of a page: a line about its subject, the result, and
     remarks.
     """
-    return element(
+    return make_element(
         "header",
-        element("p", eyebrow, class_="eyebrow"),
-        element("h1", text),
+        make_element("p", eyebrow, class_="eyebrow"),
+        make_element("h1", text),
         remarks_html(remarks),
     )
 
@@ -179,8 +182,8 @@ def remarks_html(remarks: Sequence[str]) -> Html:
     others = [remark for remark in remarks if remark not in notes]
     notes_html = _list_html(notes, "notes")
     if len(notes) > MAX_UNFOLDED_NOTES:
-        summary = element("summary", f"{len(notes)} notes on how files were read")
-        notes_html = element("details", summary, notes_html)
+        summary = make_element("summary", f"{len(notes)} notes on how files were read")
+        notes_html = make_element("details", summary, notes_html)
     return join_html(_list_html(others, "remarks"), notes_html)
 
 
@@ -188,7 +191,7 @@ def _list_html(lines: Sequence[str], css: str) -> Html | None:
     """Return a list, None without lines."""
     if not lines:
         return None
-    return element("ul", *(element("li", line) for line in lines), class_=css)
+    return make_element("ul", *(make_element("li", line) for line in lines), class_=css)
 
 
 def subject_html(*parts: tuple[str, str]) -> Html:
@@ -198,7 +201,7 @@ def subject_html(*parts: tuple[str, str]) -> Html:
     content = list[Html | str]()
     for index, (kind, text) in enumerate(parts):
         separator = ", " if index else ""
-        name = element("span", wording.short_names(text), title=text)
+        name = make_element("span", wording.shorten_names(text), title=text)
         content += [separator, f"{kind} " if kind else "", name]
     return join_html(*content)
 
@@ -206,11 +209,13 @@ def subject_html(*parts: tuple[str, str]) -> Html:
 def facts_table(facts: Mapping[str, str]) -> Html:
     """Return a table of names and values, without those that are empty."""
     lines = [
-        element("tr", element("th", name, scope="row"), element("td", value))
+        make_element(
+            "tr", make_element("th", name, scope="row"), make_element("td", value)
+        )
         for name, value in facts.items()
         if value
     ]
-    return element("table", element("tbody", *lines), class_="facts")
+    return make_element("table", make_element("tbody", *lines), class_="facts")
 
 
 def make_table(
@@ -232,19 +237,23 @@ def make_table(
     lines = []
     for index, (first, *texts) in enumerate(rows):
         link = links[index] if index < len(links) else ""
-        name = element("a", first, href=link) if link else first
-        cells = [element("th", name, scope="row")]
+        name = make_element("a", first, href=link) if link else first
+        cells = [make_element("th", name, scope="row")]
         for column, text in enumerate(texts, 1):
             share = (shares or {}).get((index, column))
-            cells.append(element("td", text, class_=_cell_class(text, share)))
+            cells.append(make_element("td", text, class_=_cell_class(text, share)))
         if bars:
-            cells.append(element("td", _interval_bar(bars[index]), class_="hide-small"))
-        lines.append(element("tr", *cells))
-    bar_head = element("td", class_="hide-small") if bars else None
-    column_heads = (element("th", text, scope="col") for text in heads)
-    head = element("tr", *column_heads, bar_head)
+            cells.append(
+                make_element("td", _interval_bar(bars[index]), class_="hide-small")
+            )
+        lines.append(make_element("tr", *cells))
+    bar_head = make_element("td", class_="hide-small") if bars else None
+    column_heads = (make_element("th", text, scope="col") for text in heads)
+    head = make_element("tr", *column_heads, bar_head)
     return make_scrollable(
-        element("table", element("thead", head), element("tbody", *lines))
+        make_element(
+            "table", make_element("thead", head), make_element("tbody", *lines)
+        )
     )
 
 
@@ -262,11 +271,13 @@ def _interval_bar(bar: tuple[float, float, float] | None) -> Html | None:
     if bar is None:
         return None
     lower, upper, mark = bar
-    range_html = element(
+    range_html = make_element(
         "span", style=f"left: {lower:.1%}; width: {upper - lower:.1%}", class_="range"
     )
-    mark_html = element("span", style=f"left: {mark:.1%}", class_="mark")
-    return element("div", range_html, mark_html, class_="interval", aria_hidden="true")
+    mark_html = make_element("span", style=f"left: {mark:.1%}", class_="mark")
+    return make_element(
+        "div", range_html, mark_html, class_="interval", aria_hidden="true"
+    )
 
 
 def link_parts(run: Path, parts: Sequence[str | None]) -> list[str]:

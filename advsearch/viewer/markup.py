@@ -1,15 +1,15 @@
-"""HTML of pages that experiments make: elements, tables, documents, and `Refused`.
+"""HTML of pages that experiments make: elements, tables, documents, and `RequestRejected`.
 
 `advsearch.extend` offers this module to added experiments. Text becomes markup only
-through `element`, which escapes it.
+through `make_element`, which escapes it.
 """
 
 from __future__ import annotations
 
 from advsearch.report.views import Html as Html
-from advsearch.report.views import element as element
 from advsearch.report.views import join_html as join_html
-from advsearch.trust.pages import Refused as Refused
+from advsearch.report.views import make_element as make_element
+from advsearch.trust.pages import RequestRejected as RequestRejected
 from advsearch.viewer.clients import MAX_BODY_BYTES as MAX_BODY_BYTES
 from advsearch.viewer.clients import NO_QR as NO_QR
 from advsearch.viewer.clients import make_qr_code as make_qr_code

@@ -22,11 +22,11 @@ from advsearch.report.views import (
     Picture,
     ResultPart,
     ShownResult,
-    element,
     join_html,
+    make_element,
 )
 from advsearch.runs.directory import CONFIG, IMAGES, OBJECT_FILE, REPORT, RunDirectory
-from advsearch.runs.files import smaller_png
+from advsearch.runs.files import shrink_png
 from advsearch.runs.results import Result
 from advsearch.runs.summary import read_result
 from advsearch.settings import format_python_only
@@ -66,18 +66,18 @@ def make_part(run: Path, part: ResultPart, description: str) -> Html:
     `description` describes the chart of a part without text of its own.
     """
     content = _part_content(run, part, description)
-    title = element("h2", part.title) if part.title else None
+    title = make_element("h2", part.title) if part.title else None
     if part.live:
-        return element(
+        return make_element(
             "div",
             title,
-            element("div", id=part.live),
+            make_element("div", id=part.live),
             content,
             hidden="hidden",
             class_="screen",
         )
     if part.folded:
-        return element("details", element("summary", part.title), content)
+        return make_element("details", make_element("summary", part.title), content)
     return join_html(title, content)
 
 
@@ -87,12 +87,12 @@ def _part_content(run: Path, part: ResultPart, description: str) -> Html:
     if part.draw is not None:
         alt = " ".join([f"{part.title}.", *(part.text or [description])])
         charts = [
-            views.study_chart(part.draw, alt, width, part.height)
-            for width in (views.WIDE, views.NARROW)
+            views.make_chart_svg(part.draw, alt, width, part.height)
+            for width in (views.WIDE_WIDTH, views.NARROW_WIDTH)
         ]
-        content.append(element("div", *charts))
+        content.append(make_element("div", *charts))
     else:
-        content += [element("p", text) for text in part.text if text]
+        content += [make_element("p", text) for text in part.text if text]
         alt = " ".join(part.text) or part.title
         content.append(_embed_figure(run, part.figure, alt))
     if part.rows and part.heads:
@@ -105,7 +105,7 @@ def _part_content(run: Path, part: ResultPart, description: str) -> Html:
     for group in part.pictures:
         content.append(_embed_images(run, group, part.layout))
     if part.note:
-        content.append(element("p", part.note, class_="soft"))
+        content.append(make_element("p", part.note, class_="soft"))
     return join_html(*content)
 
 
@@ -121,21 +121,21 @@ def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | No
             continue
         data = file.read_bytes()
         if is_png and len(data) > MAX_UNSCALED_BYTES:
-            data = smaller_png(data, MAX_SCALED_SIZE)
-        image = element(
+            data = shrink_png(data, MAX_SCALED_SIZE)
+        image = make_element(
             "img",
             src=document.make_data_url(data, MEDIA_TYPES[file.suffix.lower()]),
             alt=": ".join(filter(None, (picture.name, picture.caption))),
             data_picture=file.stem,
         )
-        name = [element("strong", picture.name), ": "] if picture.name else []
-        caption = element("figcaption", *name, picture.caption)
-        figures.append(element("figure", image, caption))
+        name = [make_element("strong", picture.name), ": "] if picture.name else []
+        caption = make_element("figcaption", *name, picture.caption)
+        figures.append(make_element("figure", image, caption))
     if not figures:
         return None
     if not layout and len(figures) < 3:
         layout = "pair"
-    return element("div", *figures, class_=f"pictures {layout}".strip())
+    return make_element("div", *figures, class_=f"pictures {layout}".strip())
 
 
 def _embed_figure(run: Path, name: str, alt: str) -> Html | None:
@@ -143,10 +143,12 @@ def _embed_figure(run: Path, name: str, alt: str) -> Html | None:
     file = find_image(run, name) if name else None
     if file is None:
         return None
-    image = element(
+    image = make_element(
         "img", src=document.make_data_url(file.read_bytes(), "image/png"), alt=alt
     )
-    return element("figure", document.make_scrollable(image, "wide"), class_="wide")
+    return make_element(
+        "figure", document.make_scrollable(image, "wide"), class_="wide"
+    )
 
 
 def make_end(run: Path, result: Result, view: ShownResult) -> Html:
@@ -156,12 +158,15 @@ def make_end(run: Path, result: Result, view: ShownResult) -> Html:
     """
     facts = {
         name[:1].upper() + name[1:]: text
-        for name, text in views.facts_of(result, view).items()
+        for name, text in views.collect_facts(result, view).items()
     }
-    content = [element("h2", "Cost and conditions"), document.facts_table(facts)]
-    if result.goes_on:
+    content = [make_element("h2", "Cost and conditions"), document.facts_table(facts)]
+    if result.is_unfinished:
         resume = shlex.join(["advsearch", "resume", str(run)])
-        content += [element("h2", "Go on"), element("pre", resume, class_="wrap")]
+        content += [
+            make_element("h2", "Go on"),
+            make_element("pre", resume, class_="wrap"),
+        ]
     config_file = run / CONFIG
     python_only = getattr(result, "python_only", [])
     repeat = ""
@@ -170,13 +175,16 @@ def make_end(run: Path, result: Result, view: ShownResult) -> Html:
     elif config_file.is_file():
         repeat = shlex.join(["advsearch", "run", str(config_file)])
     if repeat:
-        content += [element("h2", "Do it again"), element("pre", repeat, class_="wrap")]
+        content += [
+            make_element("h2", "Do it again"),
+            make_element("pre", repeat, class_="wrap"),
+        ]
     if config_file.is_file():
         settings = config_file.read_text(encoding="utf-8", errors="replace")
         if settings:
-            settings_html = element("pre", settings, class_="wrap")
-            summary = element("summary", "All settings")
-            content.append(element("details", summary, settings_html))
+            settings_html = make_element("pre", settings, class_="wrap")
+            summary = make_element("summary", "All settings")
+            content.append(make_element("details", summary, settings_html))
     return join_html(*content)
 
 
@@ -254,7 +262,7 @@ def make_run_page(run: Path, result: Result) -> str:
     """
     make_page = registry.get_experiment(result.command).page
     page: str | None = make_page(run, result) if make_page else None
-    return page or make_view_page(run, result, views.shown(result))
+    return page or make_view_page(run, result, views.get_view(result))
 
 
 def write_result(run: RunDirectory, result: AnyResult) -> AnyResult:
@@ -290,13 +298,13 @@ def make_view_page(
     if not any(part.draw or part.figure or part.pictures for part in view.sections):
         for file in sorted((run / IMAGES).glob("*.png")):
             name = file.stem.replace("-", " ").replace("_", " ").capitalize()
-            alt = f"{name}: {view.said}"
+            alt = f"{name}: {view.statement}"
             content.append(_embed_figure(run, f"{IMAGES}/{file.name}", alt))
     for part in view.sections:
-        if part.only in ("", "page") and not part.empty:
-            content.append(make_part(run, part, view.said))
+        if part.only in ("", "page") and not part.is_empty:
+            content.append(make_part(run, part, view.statement))
     content.append(_list_parts(run, list(getattr(result, "parts", ()))))
-    subject = views.subject_of(result, view)
+    subject = views.list_subjects(result, view)
     eyebrow = join_html(
         result.command,
         "; " if subject else None,
@@ -304,8 +312,8 @@ def make_view_page(
     )
     return document.make_document(
         f"{run.name}, {result.command}",
-        document.make_header(eyebrow, view.said, views.remarks_of(result, view)),
-        element("main", *content, make_end(run, result, view)),
+        document.make_header(eyebrow, view.statement, views.list_remarks(result, view)),
+        make_element("main", *content, make_end(run, result, view)),
         data=data,
         scripts=scripts,
         footer=f"run {run.name}. This page needs no other file.",
@@ -321,6 +329,8 @@ def _list_parts(run: Path, parts: list[object]) -> Html | None:
         return None
     items = []
     for name, link in zip(names, document.link_parts(run, names), strict=True):
-        items.append(element("li", element("a", name, href=link) if link else name))
-    summary = element("summary", f"The runs ({len(names)})")
-    return element("details", summary, element("ul", *items))
+        items.append(
+            make_element("li", make_element("a", name, href=link) if link else name)
+        )
+    summary = make_element("summary", f"The runs ({len(names)})")
+    return make_element("details", summary, make_element("ul", *items))

@@ -39,12 +39,18 @@ from advsearch.questions.sweep.page import (
     make_sweep_page,
 )
 from advsearch.report import wording
-from advsearch.report.views import Html, element, join_html
+from advsearch.report.views import Html, join_html, make_element
 from advsearch.runs import directory, listing, store
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
-from advsearch.runs.results import plain
-from advsearch.trust.network import https_context, is_local
-from advsearch.trust.pages import CLOSED, LOOPBACK, Refused, check_request, token_cookie
+from advsearch.runs.results import to_json_value
+from advsearch.trust.network import is_local, make_https_context
+from advsearch.trust.pages import (
+    CLOSED,
+    LOOPBACK,
+    RequestRejected,
+    check_request,
+    make_token_cookie,
+)
 from advsearch.trust.stored_files import read_bytes
 from advsearch.trust.writing import is_held
 from advsearch.viewer import clients
@@ -78,7 +84,8 @@ from advsearch.viewer.thumbnails import (
 def make_list_page(runs: Mapping[str, Path]) -> str:
     """Return the page that lists runs (directories by name), the newest first."""
     listed = [
-        (name, listing.listed_run(path, counts=False)) for name, path in runs.items()
+        (name, listing.read_listed_run(path, counts=False))
+        for name, path in runs.items()
     ]
     listed.sort(key=lambda item: item[1].when or 0.0, reverse=True)
     # a single sweep has nothing to be compared with
@@ -87,77 +94,83 @@ def make_list_page(runs: Mapping[str, Path]) -> str:
     if can_compare:
         heads.insert(0, "side by side")
     rows = [_run_row(name, run, can_compare) for name, run in listed]
-    head = element("tr", *(element("th", text, scope="col") for text in heads))
-    table = element(
-        "table", element("thead", head), element("tbody", *rows), class_="runs"
+    head = make_element(
+        "tr", *(make_element("th", text, scope="col") for text in heads)
     )
-    button = element(
-        "p", element("button", "Show the chosen sweeps side by side", type="submit")
+    table = make_element(
+        "table",
+        make_element("thead", head),
+        make_element("tbody", *rows),
+        class_="runs",
     )
-    content = element(
+    button = make_element(
+        "p",
+        make_element("button", "Show the chosen sweeps side by side", type="submit"),
+    )
+    content = make_element(
         "p", "No runs here yet: advsearch sweep, or advsearch attack, makes one."
     )
     if listed:
-        content = element(
+        content = make_element(
             "form",
             make_scrollable(table),
             button if can_compare else None,
             action="compare/",
         )
-    title = element("header", element("h1", "Runs"))
-    return make_document("Runs", title, element("main", content), connects=True)
+    title = make_element("header", make_element("h1", "Runs"))
+    return make_document("Runs", title, make_element("main", content), connects=True)
 
 
-def _run_row(name: str, run: listing.Listed, can_compare: bool) -> Html:
+def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
     """Return the row of a run in the list."""
     address = f"runs/{quote_name(name)}/"
     cells = []
     if can_compare:
         checkbox = None
         if run.command == "sweep":
-            checkbox = element(
+            checkbox = make_element(
                 "input",
                 type="checkbox",
                 name="run",
                 value=name,
                 aria_label=f"compare {name}",
             )
-        cells.append(element("td", checkbox))
-    cover_image = element(
+        cells.append(make_element("td", checkbox))
+    cover_image = make_element(
         "img", src=f"{address}cover", alt="", loading="lazy", width="72", height="72"
     )
-    cover_link = element(
+    cover_link = make_element(
         "a",
         None if run.fault else cover_image,
         href=address,
         tabindex="-1",
         aria_hidden="true",
     )
-    cells.append(element("td", cover_link))
+    cells.append(make_element("td", cover_link))
     cells.append(
-        element(
+        make_element(
             "th",
-            element("a", name, href=address),
+            make_element("a", name, href=address),
             _run_subject(name, run, address),
             scope="row",
         )
     )
     outcome = join_html(run.state, f": {run.answer}" if run.answer else None)
-    fault = element("div", run.fault, class_="remarks") if run.fault else None
-    cells.append(element("td", outcome, fault))
+    fault = make_element("div", run.fault, class_="remarks") if run.fault else None
+    cells.append(make_element("td", outcome, fault))
     start = ""
     if run.when is not None:
         start = time.strftime("%Y-%m-%d %H:%M", time.localtime(run.when))
-    cells.append(element("td", start, class_="number"))
-    return element("tr", *cells)
+    cells.append(make_element("td", start, class_="number"))
+    return make_element("tr", *cells)
 
 
-def _run_subject(name: str, run: listing.Listed, address: str) -> Html:
+def _run_subject(name: str, run: listing.ListedRun, address: str) -> Html:
     """Return what a run is about, with a link to its page for photographs."""
-    facts = (run.command, wording.short_names(run.object), " and ".join(run.controls))
+    facts = (run.command, wording.shorten_names(run.object), " and ".join(run.controls))
     photographs = None
     if run.command in ("attack", "sweep"):
-        link = element(
+        link = make_element(
             "a",
             "photographs",
             href=f"{address}align/",
@@ -165,7 +178,7 @@ def _run_subject(name: str, run: listing.Listed, address: str) -> Html:
         )
         photographs = join_html(" ", link)
     subject = ", ".join(filter(None, facts))
-    return element("div", subject, photographs, class_="soft")
+    return make_element("div", subject, photographs, class_="soft")
 
 
 # maximum evaluations in one response; the page requests the rest
@@ -187,22 +200,22 @@ def make_progress_page(name: str, run: Path) -> str:
 
     Without its script it shows the progress at the time of the request.
     """
-    listed = listing.listed_run(run)
+    listed = listing.read_listed_run(run)
     facts = (listed.command, listed.object, " and ".join(listed.controls))
     state = f"It was stopped: advsearch resume {name} goes on."
     if listed.state == "running":
         state = "A process is working on it."
     counts = [f"{count} of {kind}" for kind, count in listed.kinds.items()]
-    header = element(
+    header = make_element(
         "header",
-        element("p", ", ".join(filter(None, facts)), class_="eyebrow"),
-        element("h1", f"{name} has not ended"),
+        make_element("p", ", ".join(filter(None, facts)), class_="eyebrow"),
+        make_element("h1", f"{name} has not ended"),
     )
     state_text = f"{state} Evaluations so far: {', '.join(counts) or 'none'}."
-    main = element(
+    main = make_element(
         "main",
-        element("p", state_text, id="state"),
-        element("div", id="follow"),
+        make_element("p", state_text, id="state"),
+        make_element("div", id="follow"),
         _attack_list_html(run),
     )
     return make_document(
@@ -224,12 +237,14 @@ def _attack_list_html(run: Path) -> Html | None:
     for path in sorted((run / PARTS).glob("*")):  # attacks of a study
         if path.is_dir():
             address = f"{PARTS}/{quote_name(path.name)}/{REPORT}"
-            link = element("a", path.name, href=address)
+            link = make_element("a", path.name, href=address)
             has_page = (path / REPORT).is_file()
-            attacks.append(element("li", link if has_page else path.name))
+            attacks.append(make_element("li", link if has_page else path.name))
     if not attacks:
         return None
-    return element("div", element("h2", "Its attacks"), element("ul", *attacks))
+    return make_element(
+        "div", make_element("h2", "Its attacks"), make_element("ul", *attacks)
+    )
 
 
 def make_progress_json(run: Path, after: int) -> bytes:
@@ -253,7 +268,7 @@ def make_progress_json(run: Path, after: int) -> bytes:
             for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
                 rows.append(_row_json(row))
                 last = row.id or after
-            for number, picture in results.pictures("search", after, last):
+            for number, picture in results.iterate_images("search", after, last):
                 jpeg = make_thumbnail(picture.astype("float32") / 255.0)
                 url = make_data_url(jpeg, "image/jpeg")
                 pictures.append({"step": number, "picture": url})
@@ -264,7 +279,7 @@ def make_progress_json(run: Path, after: int) -> bytes:
         "running": running,
         "ended": ended,
     }
-    return json.dumps(plain(progress), allow_nan=False).encode()
+    return json.dumps(to_json_value(progress), allow_nan=False).encode()
 
 
 def _row_json(row: store.Row) -> dict[str, object]:
@@ -376,7 +391,7 @@ class Dashboard(HTTPServer):
         self.fingerprint = None
         self._context: ssl.SSLContext | None = None
         if https or self.token:
-            self._context, self.fingerprint = https_context(
+            self._context, self.fingerprint = make_https_context(
                 (find_reachable_address(host), "localhost", LOOPBACK)
             )
         super().__init__((host, port), _Handler, bind_and_activate=False)
@@ -427,7 +442,7 @@ class Dashboard(HTTPServer):
         if not self._explicit_runs and is_name and is_run(HOME / name):
             path = HOME / name
         if path is None:
-            raise Refused(HTTPStatus.NOT_FOUND, "there is no such run")
+            raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such run")
         check_links(path)
         return path
 
@@ -439,7 +454,7 @@ class Dashboard(HTTPServer):
             Refused: if this server takes none.
         """
         if self.photographs is None:
-            raise Refused(
+            raise RequestRejected(
                 HTTPStatus.NOT_FOUND,
                 "this server takes no photographs; advsearch dashboard does",
             )
@@ -540,12 +555,12 @@ class _Handler(BaseHTTPRequestHandler):
     def _respond(self) -> tuple[Response, dict[str, str]]:
         """Return the response to a request, and headers to send with it."""
         if not self.path.startswith("/"):
-            raise Refused(HTTPStatus.BAD_REQUEST, "this server is no proxy")
+            raise RequestRejected(HTTPStatus.BAD_REQUEST, "this server is no proxy")
         address = urlsplit(self.path)
         query = parse_qs(address.query, errors="surrogateescape")
         headers = {}
         if self.server.token and "token" in query:
-            headers["Set-Cookie"] = token_cookie(
+            headers["Set-Cookie"] = make_token_cookie(
                 self.server.server_port, self.server.token
             )
         # names of files may be no text
@@ -566,7 +581,7 @@ class _Handler(BaseHTTPRequestHandler):
                     run, file, self.headers, self.server.make_key(name), self._read_body
                 )
                 return Response(kind, data)
-        raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
+        raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _route(self, query: Query, parts: list[str]) -> Response:
         """Respond to a GET request by the parts of its path."""
@@ -604,14 +619,14 @@ class _Handler(BaseHTTPRequestHandler):
                     kinds.removesuffix("s"), server.find_run(name), file
                 )
                 return Response(kind, data)
-        raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
+        raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _serve_run(self, name: str) -> Response:
         """Return the page of a run: of a sweep, a run in progress, or a finished
         one.
         """
         run = self.server.find_run(name)
-        if listing.listed_run(run, counts=False).command == "sweep":
+        if listing.read_listed_run(run, counts=False).command == "sweep":
             page = make_sweep_page(
                 [(run, load_sweep_result(run))], [_make_source(name, run, "")]
             )
@@ -627,7 +642,7 @@ class _Handler(BaseHTTPRequestHandler):
                 if (path / REPORT).is_file():
                     return _serve_stored_page(path, "../../../../", ("../../", name))
                 break
-        raise Refused(HTTPStatus.NOT_FOUND, "there is no such attack")
+        raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such attack")
 
     def _serve_photograph_page(self, name: str) -> Response:
         """Return the page on which photographs are aligned with a run's renderings."""
@@ -645,14 +660,14 @@ class _Handler(BaseHTTPRequestHandler):
         names = dict.fromkeys(query.get("run", []))
         runs = [(name, self.server.find_run(name)) for name in names]
         if not runs:
-            raise Refused(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
+            raise RequestRejected(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
         others = [
             name
             for name, run in runs
-            if listing.listed_run(run, counts=False).command != "sweep"
+            if listing.read_listed_run(run, counts=False).command != "sweep"
         ]
         if others:
-            raise Refused(
+            raise RequestRejected(
                 HTTPStatus.BAD_REQUEST,
                 f"only sweeps can be shown side by side; {', '.join(others)} is none",
             )
@@ -669,7 +684,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Return rows of a sweep as columns; those of a finished one may be stored."""
         media_type = "application/octet-stream"
         after = _parse_after(query)
-        if not after and (run / COLUMNS).is_file() and listing.finished(run):
+        if not after and (run / COLUMNS).is_file() and listing.is_finished(run):
             stored = read_bytes(run / COLUMNS, "columns of a sweep", MAX_COLUMNS_BYTES)
             return Response(media_type, stored)
         max_rows = MAX_ROWS if after else FIRST_ROWS
@@ -690,9 +705,9 @@ class _Handler(BaseHTTPRequestHandler):
         """
         length = self.headers.get("Content-Length", "")
         if not re.fullmatch(r"[0-9]{1,15}", length):
-            raise Refused(HTTPStatus.LENGTH_REQUIRED, "its length is missing")
+            raise RequestRejected(HTTPStatus.LENGTH_REQUIRED, "its length is missing")
         if int(length) > clients.MAX_BODY_BYTES:
-            raise Refused(
+            raise RequestRejected(
                 HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
                 f"more than {clients.MAX_BODY_BYTES >> 20} MB",
             )
@@ -700,7 +715,7 @@ class _Handler(BaseHTTPRequestHandler):
         data = self.rfile.read(int(length))
         self.server.clients.report_waiting(None)
         if len(data) < int(length):
-            raise Refused(HTTPStatus.BAD_REQUEST, "a part of it did not come")
+            raise RequestRejected(HTTPStatus.BAD_REQUEST, "a part of it did not come")
         return data
 
 
@@ -708,13 +723,13 @@ def _parse_after(query: Query) -> int:
     """Return the id of the row after which rows are requested."""
     after = query.get("after", [str(FIRST_ROW_ID)])[0]
     if not re.fullmatch(r"[0-9]{1,15}", after):
-        raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
+        raise RequestRejected(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
     return int(after)
 
 
 def _describe_error(error: Exception) -> tuple[HTTPStatus, str]:
     """Return the status and the text of the response to an error."""
-    if isinstance(error, Refused):
+    if isinstance(error, RequestRejected):
         return error.status, str(error)
     if isinstance(error, AdvsearchError):
         return HTTPStatus.INTERNAL_SERVER_ERROR, str(error)
@@ -779,10 +794,10 @@ def _add_navigation(
     links = [("All runs", home)]
     if above:
         links.append((above[1], above[0]))
-    anchors = (element("a", text, href=address) for text, address in links)
+    anchors = (make_element("a", text, href=address) for text, address in links)
     navigation = join_html(
-        element("nav", *anchors, aria_label="back"),
-        element("p", remark, class_="remarks") if remark else None,
+        make_element("nav", *anchors, aria_label="back"),
+        make_element("p", remark, class_="remarks") if remark else None,
     )
     start = page.find(b"<body>") + len(b"<body>") if b"<body>" in page else 0
     return page[:start] + navigation.encode("utf-8", "replace") + page[start:]

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import format_result as text_of
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.runs.listing import can_resume, listed_runs
+from advsearch.runs.listing import can_resume, list_runs
 from advsearch.runs.store import Row, Store
 from covering import only
 from stand_ins import interrupted
@@ -395,6 +395,6 @@ def test_a_configuration_whose_check_is_interrupted_is_told_and_verified_later(
     assert first.summary.ending == "interrupted" and first.summary.verified is None and first.search is not None
     assert said in text_of(first.summary) and said in (run / "report.html").read_text()
     assert "advsearch resume" in (run / "report.html").read_text()
-    assert listed_runs(tmp_path)[0].answer == "vase, unverified"
+    assert list_runs(tmp_path)[0].answer == "vase, unverified"
     done = advsearch.attack(scene, wrong, **asked, resume=True)
-    assert done.found and torch.equal(done.u, first.u) and listed_runs(tmp_path)[0].answer == "6/6"
+    assert done.found and torch.equal(done.u, first.u) and list_runs(tmp_path)[0].answer == "6/6"

@@ -25,7 +25,7 @@ from advsearch.controls import CONTROLS, LightControl, PoseControl
 from advsearch.engine.loading import controls_to_settings, list_control_instances, make_controls
 from advsearch.engine.naming import make_configured_controls
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
-from advsearch.progress import BarProgress, LineProgress, NotebookProgress, NullProgress, watched
+from advsearch.progress import BarProgress, LineProgress, NotebookProgress, NullProgress, open_progress
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.region.result import RegionResult
@@ -308,7 +308,7 @@ def test_progress_is_a_bar_where_somebody_looks(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def watcher(asked: Any) -> type[Any]:
-        with watched(asked) as progress:
+        with open_progress(asked) as progress:
             progress.stage("searching", 4)
             progress.advance(2, best=0.5)
             progress.message("a sentence")
@@ -326,7 +326,7 @@ def test_progress_is_a_bar_where_somebody_looks(
     shell = types.SimpleNamespace(kernel=object())
     notebook = types.SimpleNamespace(get_ipython=lambda: shell, display=types.SimpleNamespace(display=display))
     monkeypatch.setitem(sys.modules, "IPython", notebook)
-    monkeypatch.setattr("advsearch.progress.UPDATE", 0.0)
+    monkeypatch.setattr("advsearch.progress.MIN_UPDATE_SECONDS", 0.0)
     assert watcher(True) is NotebookProgress
     assert any(re.search(r"searching, 2 of 4.*best 0\.5", one) for one in shown) and not shown[-1]
     assert capsys.readouterr().out == "a sentence\n"

@@ -132,7 +132,7 @@ def answered(path: Path, **more: Any) -> Path:
     run = make_attacked(path, config, np.full(6, 0.25))
     with RunDirectory.resume(run) as held:
         for kind, wrong in (("control", False), ("verification", True)):
-            held.record(*(Row(kind, k, seed=k, spp=1, correct=not wrong, label="a") for k in range(3)))
+            held.append_rows(*(Row(kind, k, seed=k, spp=1, correct=not wrong, label="a") for k in range(3)))
     return run
 
 

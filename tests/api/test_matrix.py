@@ -66,7 +66,7 @@ def test_every_adversarial_scene_is_tried_on_every_model(
     assert all(cell.verified.trials == 6 and cell.verified.spp == 4 for cell in verified.values())
     assert read_result(run).to_dict() == result.to_dict()
     with Store(run / "results.sqlite", read_only=True) as store:
-        counts = store.counts()
+        counts = store.count_by_kind()
         seeds = {tuple(row.seed for row in store.rows(kind)) for kind in counts}
     assert len(counts) == 6 and set(counts.values()) == {6} and len(seeds) == 1, "the same seeds for all"
     assert main(["show", str(run)]) == 0
@@ -92,7 +92,7 @@ def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
 
     monkeypatch.setattr(Retrials, "_render", stopped)
     first = carried_out(tmp_path / "run")
-    assert first.ending == "interrupted" and first.goes_on
+    assert first.ending == "interrupted" and first.is_unfinished
     again = attack.run(AttackConfig.from_yaml(tmp_path / "run" / "run.yaml"), resumed=tmp_path / "run")
     assert isinstance(again, MatrixResult) and again.ending == "done"
     assert [row.tested for row in again.table] == [row.tested for row in whole.table]

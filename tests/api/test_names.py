@@ -13,7 +13,7 @@ import pytest
 from advsearch.api.names import LABEL_SETS, PARAMETERS
 from advsearch.cli.main import main
 from advsearch.controls import CONTROLS
-from advsearch.errors import resembling
+from advsearch.errors import find_similar_names
 from advsearch.models.labels import SETS
 from advsearch.runs.directory import CONFIG
 from advsearch.settings import HEADER
@@ -72,5 +72,5 @@ def test_nothing_heavy_is_imported_to_tell_it() -> None:
 
 def test_names_that_are_listed_here_are_those_of_the_registries() -> None:
     parameters = {parameter.name for control in CONTROLS.values() for parameter in control.parameters}
-    assert {name for name in parameters - {*CONTROLS} if resembling(name, CONTROLS)} == PARAMETERS
+    assert {name for name in parameters - {*CONTROLS} if find_similar_names(name, CONTROLS)} == PARAMETERS
     assert LABEL_SETS == SETS

@@ -15,7 +15,7 @@ import advsearch
 import samples
 from advsearch.cli.main import main
 from advsearch.errors import InputError
-from advsearch.report.figures import GAP, LINE, NARROWEST, columns_for, contact_sheet
+from advsearch.report.figures import GAP, LINE, MIN_TILE_WIDTH, choose_column_count, make_contact_sheet
 from advsearch.runs.files import read_png
 from advsearch.scene.color import linear_to_srgb
 
@@ -81,7 +81,7 @@ def test_around_is_one_sheet_at_one_exposure(tmp_path: Path, capsys: pytest.Capt
     assert all(len(view["answers"]) == 5 for view in found["views"])
     sheet = read_png(out)
     assert list(sheet.shape[:2]) == found["size"]
-    tile = sheet[GAP : GAP + NARROWEST, GAP : GAP + NARROWEST]
+    tile = sheet[GAP : GAP + MIN_TILE_WIDTH, GAP : GAP + MIN_TILE_WIDTH]
     scene = advsearch.load_scene("mug", settings={"camera.azimuth": 130.0})
     alone = advsearch.render(scene, resolution=16, spp=1)
     np.testing.assert_allclose(tile[::10, ::10], alone.views[0].picture.numpy(), atol=1e-6)
@@ -144,12 +144,14 @@ def test_from_python_a_scene_or_a_name(tmp_path: Path) -> None:
 
 
 def test_a_sheet_has_few_holes_and_cuts_long_names() -> None:
-    assert [columns_for(count) for count in (1, 2, 3, 4, 6, 7, 8, 12, 24)] == [1, 2, 3, 2, 3, 3, 4, 4, 6]
+    assert [choose_column_count(count) for count in (1, 2, 3, 4, 6, 7, 8, 12, 24)] == [1, 2, 3, 2, 3, 3, 4, 4, 6]
     picture = np.full((16, 16, 3), 0.5, dtype=np.float32)
-    sheet = contact_sheet([picture] * 2, [["azimuth 40", "x" * 5000], ["azimuth 220"]])
-    assert sheet.shape == (2 * GAP + NARROWEST + 2 * LINE, GAP + 2 * (NARROWEST + GAP), 3)
-    text = sheet[GAP + NARROWEST :, :, 0] < 0.5
-    assert text[:, GAP : GAP + NARROWEST].any() and not text[:, GAP + NARROWEST : 2 * GAP + NARROWEST].any()
+    sheet = make_contact_sheet([picture] * 2, [["azimuth 40", "x" * 5000], ["azimuth 220"]])
+    assert sheet.shape == (2 * GAP + MIN_TILE_WIDTH + 2 * LINE, GAP + 2 * (MIN_TILE_WIDTH + GAP), 3)
+    text = sheet[GAP + MIN_TILE_WIDTH :, :, 0] < 0.5
+    assert (
+        text[:, GAP : GAP + MIN_TILE_WIDTH].any() and not text[:, GAP + MIN_TILE_WIDTH : 2 * GAP + MIN_TILE_WIDTH].any()
+    )
 
 
 @pytest.mark.medium

@@ -395,7 +395,7 @@ def test_a_run_goes_on_with_the_objective_and_the_weights_that_it_began_with(
         advsearch.attack(scene, victim(level + 0.05), objective=own(1.0), **again)
     assert advsearch.attack(scene, model, objective=own(1.0), **again).summary.ending != "interrupted"
     with Store(run / "results.sqlite", read_only=True) as store:
-        noted = store.noted("made of")
+        noted = store.read_json_note("made of")
     assert len(noted["objective"]) == len(noted["model bright"]) == 64
 
 
@@ -433,7 +433,7 @@ def test_a_sweep_goes_on_with_the_weights_that_it_began_with(scene: advsearch.Sc
             with pytest.raises(InputError, match=r"cannot resume with .* began with: model bright;"):
                 advsearch.sweep(scene, victim(0.6), grid, run=tmp_path / "run", **asked)
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
-        assert store.count("sweep") == 4
+        assert store.count_rows("sweep") == 4
 
 
 @pytest.mark.medium

@@ -15,8 +15,8 @@ import pytest
 import advsearch
 import samples
 from advsearch.cli.main import main
-from advsearch.cli.output import shown_text as region_text
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import format_result as region_text
+from advsearch.cli.output import format_result as text_of
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.experiment import RunContext, run_and_save, run_experiment
@@ -28,7 +28,7 @@ from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.region import boxes, growing, region
 from advsearch.questions.region.result import RegionConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.listing import finished, listed_runs
+from advsearch.runs.listing import is_finished, list_runs
 from advsearch.runs.summary import read_result
 from samples import ATTACK, AVERAGE, rated
 from samples import attack as attacked
@@ -191,7 +191,7 @@ def test_a_region_that_is_interrupted_says_how_to_go_on(
     assert said.startswith("Stopped before the box was known.") and "renders       1\n" in said
     assert said.endswith(f"Go on with: advsearch resume {folder}\n")
     assert main(["show", str(folder)]) == 0 and capsys.readouterr().out == said
-    assert not finished(folder) and listed_runs(tmp_path)[0].state == "stopped"
+    assert not is_finished(folder) and list_runs(tmp_path)[0].state == "stopped"
 
 
 @pytest.mark.parametrize(

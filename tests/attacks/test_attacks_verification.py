@@ -29,7 +29,7 @@ from advsearch.attacks import (
     search,
     verify,
 )
-from advsearch.attacks.trials import MarginsOf, derive_trial_seed, most_samples
+from advsearch.attacks.trials import MarginsOf, count_max_samples, derive_trial_seed
 from advsearch.attacks.verification import (
     EASIER,
     MIN_RATE,
@@ -245,7 +245,7 @@ def test_a_decision_that_no_rung_can_settle_is_seldom_rendered_up_to_the_last() 
         choice = choose_spp({"adversarial": at_the_decision, "clean": drifting(-6.0, 0.0, 0.1)}, seed=seed)
         assert (choice.spp, choice.converged) == (256, False)
         assert {rung.name for rung in choice.table} == {"adversarial"}, "the other one decides nothing any more"
-    assert sum(spent) < 0.7 * 20 * most_samples(1)
+    assert sum(spent) < 0.7 * 20 * count_max_samples(1)
 
 
 @pytest.mark.parametrize(("limit", "bias", "noise"), [(1.0, 1.0, 0.1), (3.0, 3.0, 0.5), (-2.0, -2.0, 0.2)])

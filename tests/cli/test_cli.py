@@ -23,14 +23,14 @@ import samples
 from advsearch import __version__
 from advsearch.cli import doctor
 from advsearch.cli import show as names
-from advsearch.cli.flags import with_flags
+from advsearch.cli.flags import format_as_flags
 from advsearch.cli.main import get_command_help, list_commands, main
-from advsearch.cli.output import aligned, finish
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import align_columns, print_result
+from advsearch.cli.output import format_result as text_of
 from advsearch.controls.base import Choice
 from advsearch.errors import InputError, StorageError
 from advsearch.options import Value
-from advsearch.progress import BarProgress, LineProgress, NullProgress, Progress, watched
+from advsearch.progress import BarProgress, LineProgress, NullProgress, Progress, open_progress
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.settings import SweepConfig
@@ -191,7 +191,7 @@ def test_bad_input_is_one_line_and_status_2(
     ],
 )
 def test_settings_in_messages_become_flags(message: str, shown: str) -> None:
-    assert with_flags(message) == shown
+    assert format_as_flags(message) == shown
 
 
 def test_a_message_names_the_argument_in_python_and_the_flag_on_the_command_line(
@@ -246,8 +246,8 @@ def test_a_result_of_a_run_that_was_stopped_has_the_status_of_an_interrupt(
     ending: str, status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     result: Any = types.SimpleNamespace(ending=ending, run=None)
-    monkeypatch.setattr("advsearch.cli.output.shown_text", lambda result: "the result")
-    assert finish(result, as_json=False) == status
+    monkeypatch.setattr("advsearch.cli.output.format_result", lambda result: "the result")
+    assert print_result(result, as_json=False) == status
 
 
 SWALLOWING = """
@@ -589,7 +589,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     make_run(tmp_path / "runs" / "done", pictures=False)
     with RunDirectory.create_for(AttackConfig(object="mug", controls=["pose"], run="killed")) as run:
         yaw: dict[str, Value] = {"pose.yaw": {"value": 12.5, "unit": "degrees"}}
-        run.record(Row("search", 0, objective=0.5, success=True, values=yaw), Row("control", 0))
+        run.append_rows(Row("search", 0, objective=0.5, success=True, values=yaw), Row("control", 0))
     return tmp_path
 
 
@@ -607,7 +607,7 @@ def test_resume_goes_on_with_what_was_stopped(
     api: Callable[..., None], runs: Path, config: Config, answer: Any
 ) -> None:
     with RunDirectory.create_for(config) as run:
-        run.record(Row("search", 0))
+        run.append_rows(Row("search", 0))
     found: list[Any] = []
 
     def goes_on(config: Config, *, progress: Progress, resumed: Path | None) -> Any:
@@ -923,8 +923,8 @@ def test_a_table_of_almost_nothing() -> None:
 
 
 def test_columns() -> None:
-    assert aligned([["a", "bb", "c"], ["aaa", "b"]]) == "  a     bb   c\n  aaa   b"
-    assert aligned([]) == ""
+    assert align_columns([["a", "bb", "c"], ["aaa", "b"]]) == "  a     bb   c\n  aaa   b"
+    assert align_columns([]) == ""
 
 
 # ---- progress ----
@@ -942,7 +942,7 @@ class Clock:
 
 def test_lines_come_at_most_every_five_seconds_and_messages_at_once() -> None:
     stream, clock = io.StringIO(), Clock()
-    progress = LineProgress(stream, with_flags, clock)
+    progress = LineProgress(stream, format_as_flags, clock)
     progress.stage("searching", 40, hint="40 pictures; `steps` shortens it", at_most=True)
     for _ in range(12):
         clock.now += 1.0
@@ -974,8 +974,8 @@ def test_lines_come_at_most_every_five_seconds_and_messages_at_once() -> None:
 def test_lines_come_where_nothing_is_counted_too(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
     monkeypatch.setattr("sys.stderr", stream)
-    monkeypatch.setattr("advsearch.progress.PATIENCE", 0.0)
-    with watched(True, with_flags) as progress:
+    monkeypatch.setattr("advsearch.progress.ANNOUNCE_SECONDS", 0.0)
+    with open_progress(True, format_as_flags) as progress:
         progress.stage("compiling")
         for _ in range(1200):
             if stream.getvalue():
@@ -1008,7 +1008,7 @@ def test_a_terminal_shows_the_last_stages_with_counts_and_times(monkeypatch: pyt
     monkeypatch.setattr("sys.stderr", stream)
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setenv("COLUMNS", "120")
-    with watched(True, with_flags) as progress:
+    with open_progress(True, format_as_flags) as progress:
         for number in range(9):
             progress.stage(f"stage {number}")
         progress.stage("searching", 40, hint="`steps` shortens it", at_most=True)
@@ -1039,7 +1039,7 @@ def test_what_loads_much_says_that_it_starts(
 
 def test_who_watches(monkeypatch: pytest.MonkeyPatch) -> None:
     def watcher(quiet: bool = False) -> type[Progress]:
-        with watched(not quiet) as progress:
+        with open_progress(not quiet) as progress:
             progress.stage("search", 3)
             progress.advance(1, best=0.5)
             progress.message("text")

@@ -30,7 +30,7 @@ def _fresh() -> Iterator[None]:
 def well(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every part works, and nothing is really tried."""
     monkeypatch.setattr(doctor, "run_probe", lambda: ALL_WELL)
-    monkeypatch.setattr(doctor, "reference_weights", lambda: doctor.Component("reference model", "", doctor.OK))
+    monkeypatch.setattr(doctor, "check_reference_weights", lambda: doctor.Component("reference model", "", doctor.OK))
 
 
 def process_that(code: str) -> tuple[str, ...]:
@@ -69,18 +69,18 @@ def test_a_part_that_does_not_work_is_told_with_what_to_do_and_status_3(
 def test_a_missing_optional_part_is_a_warning(
     well: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "installed_version", lambda name: None if name == "pyarrow" else "1.0")
+    monkeypatch.setattr(doctor, "find_installed_version", lambda name: None if name == "pyarrow" else "1.0")
     assert doctor.doctor.run(Namespace(json=True)) == 0
     (part,) = (p for p in json.loads(capsys.readouterr().out)["parts"] if p["name"] == "pyarrow")
     assert part["status"] == "warning" and "Parquet" in part["detail"]
 
 
 def test_a_missing_package_is_told() -> None:
-    parts = {part.name: part for part in doctor.packages(ALL_WELL)}
+    parts = {part.name: part for part in doctor.check_packages(ALL_WELL)}
     assert {part.status for part in parts.values()} == {doctor.OK}
-    part = doctor.other_packages(["rich>=13", "surely-not-installed==1", 'dev-only; extra == "dev"', "numpy"])
+    part = doctor.check_other_packages(["rich>=13", "surely-not-installed==1", 'dev-only; extra == "dev"', "numpy"])
     assert (part.status, part.detail) == (doctor.MISSING, "not installed: surely-not-installed")
-    assert doctor.other_packages(["rich>=13"]).status == doctor.OK
+    assert doctor.check_other_packages(["rich>=13"]).status == doctor.OK
 
 
 def test_a_process_that_is_taken_down_leaves_the_parts_before_it_and_how_it_ended() -> None:
@@ -91,7 +91,7 @@ def test_a_process_that_is_taken_down_leaves_the_parts_before_it_and_how_it_ende
     )
     tried = doctor.run_probe(process_that(code))
     assert set(tried) == {"numpy", ""}
-    parts = {part.name: part for part in doctor.packages(tried)}
+    parts = {part.name: part for part in doctor.check_packages(tried)}
     assert parts["numpy"].status == doctor.OK
     assert parts["render"].status == doctor.BROKEN
     assert "SIGABRT (LLVM ERROR: Cannot select" in parts["render"].detail
@@ -132,17 +132,17 @@ def test_llvm_that_the_variable_names_wrongly_is_broken(monkeypatch: pytest.Monk
 
 
 def test_a_cache_folder_that_cannot_be_made_is_a_warning(tmp_path: Path) -> None:
-    assert doctor.kernel_cache(tmp_path / "cache").detail.endswith("0 files, 0 MB")
+    assert doctor.check_kernel_cache(tmp_path / "cache").detail.endswith("0 files, 0 MB")
     (tmp_path / "file").touch()
-    part = doctor.kernel_cache(tmp_path / "file" / "cache")
+    part = doctor.check_kernel_cache(tmp_path / "file" / "cache")
     assert part.status == doctor.WARNING and "cannot be written" in part.detail
 
 
 def test_little_disk_or_memory_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert (doctor.disk(tmp_path).status, doctor.check_hardware().status) == (doctor.OK, doctor.OK)
+    assert (doctor.check_disk(tmp_path).status, doctor.check_hardware().status) == (doctor.OK, doctor.OK)
     monkeypatch.setattr(doctor, "DISK_WANTED", 2**80)
     monkeypatch.setattr(doctor, "MEMORY_WANTED", 2**80)
-    assert (doctor.disk(tmp_path).status, doctor.check_hardware().status) == (doctor.WARNING, doctor.WARNING)
+    assert (doctor.check_disk(tmp_path).status, doctor.check_hardware().status) == (doctor.WARNING, doctor.WARNING)
 
 
 @pytest.mark.medium

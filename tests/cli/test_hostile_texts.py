@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from advsearch.cli.main import main
-from advsearch.cli.output import shortened
+from advsearch.cli.output import shorten_words
 from advsearch.errors import FileFormatError
 from advsearch.models import read_labels
-from advsearch.progress import escaped
+from advsearch.progress import escape_text
 from advsearch.settings import parse_assignment, read_yaml
 from advsearch.trust.yaml_text import parse_yaml
 
@@ -150,14 +150,16 @@ def test_label_files_are_ordinary_files(tmp_path: Path) -> None:
 
 
 def test_what_steers_a_terminal_becomes_readable() -> None:
-    assert escaped(f"a{ESCAPES}b") == r"a\x1b]0;title\x07\x9b31m\x7f\u202e\x0db"
-    assert escaped("mug \u2014 coffee\u00a0cup\n\t\u00e9") == "mug \u2014 coffee\u00a0cup\n\t\u00e9"
-    assert escaped("\u00e9\udc80", "ascii") == r"\xe9\udc80"
+    assert escape_text(f"a{ESCAPES}b") == r"a\x1b]0;title\x07\x9b31m\x7f\u202e\x0db"
+    assert escape_text("mug \u2014 coffee\u00a0cup\n\t\u00e9") == "mug \u2014 coffee\u00a0cup\n\t\u00e9"
+    assert escape_text("\u00e9\udc80", "ascii") == r"\xe9\udc80"
 
 
 def test_long_words_of_a_message_are_shortened() -> None:
-    assert shortened("unknown object " + "x" * 5000) == f"unknown object {'x' * 100}...{'x' * 40} (5,000 characters)"
-    assert shortened("a short message") == "a short message"
+    assert (
+        shorten_words("unknown object " + "x" * 5000) == f"unknown object {'x' * 100}...{'x' * 40} (5,000 characters)"
+    )
+    assert shorten_words("a short message") == "a short message"
 
 
 @pytest.mark.parametrize(
@@ -204,9 +206,9 @@ def test_names_are_shown_short_and_without_escapes(
 
 def test_json_for_a_terminal_is_json_still(capsys: pytest.CaptureFixture[str]) -> None:
     from advsearch.cli import output
-    from advsearch.cli.output import screens
+    from advsearch.cli.output import escape_output
 
-    with screens():
+    with escape_output():
         output.print_json({"name": ESCAPES, "\u00e9": "\U000e0001"})
     text = capsys.readouterr().out
     assert json.loads(text) == {"name": ESCAPES, "\u00e9": "\U000e0001"} and text.replace("\n", "").isprintable()

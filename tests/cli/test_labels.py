@@ -13,7 +13,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch import models
 from advsearch.cli.main import main
-from advsearch.errors import InputError, UnknownNameError, resembling
+from advsearch.errors import InputError, UnknownNameError, find_similar_names
 from advsearch.models import find_label_set, find_similar_labels, read_labels
 from advsearch.models.labels import SETS
 
@@ -39,7 +39,7 @@ LABELS = ("pug", "coffee mug", "frying pan, frypan", "giant panda", "cup", "mosq
 )
 def test_whole_words_come_first_then_beginnings_then_parts_then_spelling(word: str, found: list[str]) -> None:
     names = ["pug", "frypan", "coffee mug", "giant panda", "frying pan", "mosque", "glasses"]
-    assert resembling(word, names) == found
+    assert find_similar_names(word, names) == found
 
 
 @pytest.mark.parametrize(("name", "near"), [("step", "steps"), ("azimuth", "camera.azimuth"), ("smug", "mug")])
@@ -50,7 +50,7 @@ def test_every_unknown_name_is_helped_in_the_same_way(name: str, near: str) -> N
 
 
 def test_a_name_of_any_length_is_compared_at_once() -> None:
-    assert resembling("x" * 100_000, ["coffee mug"] * 10 + [f"label {number}" for number in range(1000)]) == []
+    assert find_similar_names("x" * 100_000, ["coffee mug"] * 10 + [f"label {number}" for number in range(1000)]) == []
 
 
 def test_labels_match_by_their_synonyms() -> None:

@@ -28,7 +28,7 @@ from advsearch.questions.photographs.carry_out import Photographs
 from advsearch.questions.photographs.pages import PhotographPages
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER
-from advsearch.trust.code import allow_named, allowed_code, nothing_allowed
+from advsearch.trust.code import allow_named, allowed_code, restrict_allowed_code
 from samples import make_attacked
 from stored_sweeps import make_sweep
 
@@ -86,7 +86,7 @@ def sent(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def here(sent: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     shutil.copytree(sent, tmp_path / "sent")
     monkeypatch.chdir(tmp_path / "sent")
-    with nothing_allowed():
+    with restrict_allowed_code():
         yield
     sys.modules.pop("planted", None)
 

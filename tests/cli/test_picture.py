@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from advsearch.cli.main import main
-from advsearch.cli.show import best_pictures
+from advsearch.cli.show import find_best_images
 from samples import make_run
 from stored_sweeps import make_sweep
 
@@ -100,10 +100,10 @@ def test_without_the_package_it_is_named(
 
 
 def test_of_another_run_the_first_picture_is_shown(run: Path, tmp_path: Path) -> None:
-    assert [one.name for one in best_pictures(run)] == ["clean.png", "adversarial.png"]
+    assert [one.name for one in find_best_images(run)] == ["clean.png", "adversarial.png"]
     swept = make_sweep(tmp_path / "swept")
     (swept / "images").mkdir(exist_ok=True)
     (swept / "images" / "sweep.png").write_bytes(b"")
-    assert [one.name for one in best_pictures(swept)] == ["sweep.png"]
+    assert [one.name for one in find_best_images(swept)] == ["sweep.png"]
     (swept / "images" / "sweep.png").unlink()
-    assert best_pictures(swept) == []
+    assert find_best_images(swept) == []

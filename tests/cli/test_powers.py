@@ -20,7 +20,7 @@ from advsearch.questions.sweep import carry_out as sweeping
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER, settings
-from advsearch.threads import cores
+from advsearch.threads import count_cores
 from advsearch.trust import powers
 from advsearch.trust.code import allow_code
 from stored_sweeps import make_sweep
@@ -50,7 +50,7 @@ CASES = [
     (command, one.name)
     for command in COMMANDS
     for one in settings(CONFIGS[command])
-    if one.power is not powers.none
+    if one.power is not powers.no_power
 ]  # fmt: skip
 """Every such setting of every command that a file may name."""
 
@@ -81,7 +81,7 @@ def test_every_setting_that_reaches_beyond_the_run_says_so() -> None:
             inside = {"aov", "suite", "attack", "keep_pictures", "compared", "sweeps", "ask"}
             inside |= {"model", "models"}  # what only a file names is asked nothing (test_addresses.py)
             if any(word in text for word in suspicious) and one.name not in inside:
-                assert one.power is not powers.none, f"{command}: {text}"
+                assert one.power is not powers.no_power, f"{command}: {text}"
 
 
 @pytest.mark.parametrize(("command", "name"), CASES)
@@ -118,7 +118,7 @@ def test_a_base_asks_in_vain_too(capsys: pytest.CaptureFixture[str]) -> None:
     Path("base.yaml").write_text(f"workers: &many {MANY}\nsteps: 3\n")
     Path("b.yaml").write_text("base: base.yaml\nobject: mug\ncontrols: pose\nworkers: '90000'\n")
     assert main(["run", "b.yaml", "--quiet"]) == 2
-    assert f"workers: starts 90000 processes on {cores()} processors" in capsys.readouterr().err
+    assert f"workers: starts 90000 processes on {count_cores()} processors" in capsys.readouterr().err
 
 
 @pytest.mark.medium
@@ -143,7 +143,7 @@ def test_a_run_goes_on_without_and_says_what_to_type(
     error = capsys.readouterr().err
     assert "cluster is left out: it connects to tcp://127.0.0.1:1, and what answers there can run code here" in error
     assert "log is left out: it sends every evaluation to mlflow; type log=mlflow if you want that" in error
-    assert f"workers is left out: it starts {MANY} processes on {cores()} processors" in error
+    assert f"workers is left out: it starts {MANY} processes on {count_cores()} processors" in error
     assert main(["resume", "sent", "workers=2", "cluster=cluster.yaml", "--quiet"]) == 2
     assert [(one.cluster, one.log, one.workers) for one in seen] == [(None, None, None), ("cluster.yaml", None, 2)]
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.cli.flags import with_flags
+from advsearch.cli.flags import format_as_flags
 from advsearch.cli.main import main
 from advsearch.controls import Space, make_control, make_space
 from advsearch.controls.base import describe_adjusted_defaults
@@ -19,7 +19,7 @@ from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.runs.results import plain
+from advsearch.runs.results import to_json_value
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import DEFAULT_ENVIRONMENT, SceneDescription, load_description
 
@@ -79,8 +79,8 @@ REFUSED: dict[str, tuple[dict[str, float], str | None, dict[str, Any], str]] = {
 def test_a_control_that_leaves_out_what_was_asked_for_is_refused(name: str) -> None:
     given, environment, controls, message = REFUSED[name]
     with pytest.raises(InputError) as error:
-        space_of(load_description("mug", environment, given=given), **controls)
-    assert message in with_flags(str(error.value))
+        space_of(load_description("mug", environment, setting_values=given), **controls)
+    assert message in format_as_flags(str(error.value))
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_a_control_that_leaves_out_what_was_asked_for_is_refused(name: str) -> N
 def test_a_control_that_agrees_starts_at_what_was_asked_for(
     given: dict[str, float], environment: str, controls: dict[str, Any]
 ) -> None:
-    scene = load_description("mug", environment, given=given)
+    scene = load_description("mug", environment, setting_values=given)
     space = space_of(scene, **controls)
     assert space.adjusted_defaults == ()
     for name, value in space.describe(space.start).items():
@@ -189,7 +189,9 @@ def test_what_moved_is_in_the_summary_in_the_report_and_on_the_screen(tmp_path: 
         verify_spp=1, baseline=False, run=tmp_path / "run", progress=screen,
     )  # fmt: skip
     summary = result.summary
-    assert plain(summary.clean.moved) == [{"parameter": "pose.yaw", "unit": "degrees", "scene": 0.0, "used": 90.0}]
+    assert to_json_value(summary.clean.moved) == [
+        {"parameter": "pose.yaw", "unit": "degrees", "scene": 0.0, "used": 90.0}
+    ]
     said = "The clean scene has pose.yaw 90 degrees instead of 0, which the control pose leaves out."
     assert said in summary.warnings and said in screen.said
     assert said in (tmp_path / "run" / "report.html").read_text("utf-8")
@@ -218,7 +220,7 @@ def test_an_exposure_that_is_searched_is_over_the_metered_one_and_not_over_the_o
 
 
 def test_a_distance_that_is_set_does_not_follow_the_field_of_view() -> None:
-    near = load_description("mug", given={"camera.distance": 2.0})
+    near = load_description("mug", setting_values={"camera.distance": 2.0})
     for scene, stays in ((near, True), (load_description("mug"), False)):
         space = space_of(scene, camera={"fov": [20, 60]})
         near_end, far_end = (space.inputs(torch.tensor([share]))["camera.to_world"][:3, 3] for share in (0.0, 1.0))
@@ -251,7 +253,7 @@ def test_a_distance_that_is_set_does_not_follow_the_field_of_view() -> None:
 def test_a_sweep_refuses_what_contradicts_its_scenes(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError) as error:
         sweep_from_config(SweepConfig(**{"object": "mug", "trials": 0, **options}))
-    assert message in with_flags(str(error.value))
+    assert message in format_as_flags(str(error.value))
 
 
 def test_the_grid_of_a_control_of_ones_own_is_checked_too() -> None:

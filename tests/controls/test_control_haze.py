@@ -54,7 +54,7 @@ def test_density_0_is_the_scene_without_haze() -> None:
 def test_black_haze_takes_light_out_as_beer_and_lambert_say() -> None:
     """An environment of radiance 1 seen past the object: exp(-density * length through the ball)."""
     white = EnvironmentAsset("white", np.ones((8, 16, 3), np.float32))
-    scene = replace(load_description("mug", given={"ground.size": 0.0}), environment=white)
+    scene = replace(load_description("mug", setting_values={"ground.size": 0.0}), environment=white)
     prepared = HazeControl().prepare(scene)
     (part,) = prepared.parts
     assert isinstance(part, HazePart)
@@ -71,7 +71,7 @@ def test_black_haze_takes_light_out_as_beer_and_lambert_say() -> None:
 def test_white_haze_under_even_light_stays_white() -> None:
     """The furnace test: an object that reflects nearly all light disappears, and nothing gets darker."""
     white = EnvironmentAsset("white", np.ones((8, 16, 3), np.float32))
-    scene = replace(load_description("mug", given={"ground.size": 0.0, "pose.scale": 0.01}), environment=white)
+    scene = replace(load_description("mug", setting_values={"ground.size": 0.0, "pose.scale": 0.01}), environment=white)
     furnace = MitsubaScene(HazeControl().prepare(scene), (SIDE, SIDE))
     assert float(furnace.render_radiance(haze(0.15, WHITE), 0, 64).mean()) == pytest.approx(1.0, abs=0.01)
     assert float(furnace.render_radiance(haze(0.3, WHITE), 0, 64).mean()) == pytest.approx(0.985, abs=0.02)
@@ -125,7 +125,7 @@ def test_camera_and_object_are_inside() -> None:
     (part,) = HazeControl().prepare(plain()).parts
     assert isinstance(part, HazePart)
     assert part.radius >= max(MIN_RADIUS, 1.4 * float(np.linalg.norm(camera_to_world(plain())[:3, 3])))
-    (far,) = HazeControl().prepare(load_description("mug", size=1.0, given={"camera.distance": 20.0})).parts
+    (far,) = HazeControl().prepare(load_description("mug", size=1.0, setting_values={"camera.distance": 20.0})).parts
     assert isinstance(far, HazePart) and far.radius > 28.0
 
 

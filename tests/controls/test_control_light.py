@@ -51,7 +51,7 @@ def test_the_unit_of_power_shows_a_white_surface_just_below_white(scene: SceneDe
 def test_a_lamp_puts_its_power_over_the_squared_distance_on_what_faces_it(type: str) -> None:
     """White ground below a lamp in the dark: radiance = albedo E / pi / d^2 for each channel."""
     scene = load_description(
-        "mug", DARK, given={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0}
+        "mug", DARK, setting_values={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0}
     )
     settings: dict[str, Any] = {"size": 0.05} if type == "area" else {}
     control = LightControl(type=type, x=[0, 1], y=0, z=2, red=1, green=0.5, blue=0, power=3, **settings)

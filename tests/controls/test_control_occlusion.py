@@ -127,7 +127,9 @@ SEEN = {
 @pytest.mark.parametrize("through", list(SEEN))
 def test_primary_rays_find_the_same_share(through: str, which: str) -> None:
     model, settings = SEEN[through]
-    scene = replace(load_description("mug", size=1.0, given=settings), aspect=2.0 if through == "wide picture" else 1.0)
+    scene = replace(
+        load_description("mug", size=1.0, setting_values=settings), aspect=2.0 if through == "wide picture" else 1.0
+    )
     scene = replace(scene, camera_model=model if model.name else None)
     control = OcclusionControl(which=which, coverage=[0, 0.3], direction=30.0, size=0.9, turn=50.0)
     bound = control.bind(control.prepare(scene))

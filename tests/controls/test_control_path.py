@@ -29,7 +29,7 @@ WAY = "time, x, y, z\n3, 2, 0, 1\n4, 2, 2, 1\n7, -2, 2, 1\n"
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return load_description("mug", size=1.0, given={"camera.roll": 20.0, "camera.azimuth": 70.0})
+    return load_description("mug", size=1.0, setting_values={"camera.roll": 20.0, "camera.azimuth": 70.0})
 
 
 def bound(scene: SceneDescription, **given: Any) -> PathControl:
@@ -63,7 +63,7 @@ def test_a_frame_of_each_path_is_the_scene_as_it_is_and_others_are_not(
 
 @pytest.mark.parametrize("moves", ["camera", "object"])
 def test_distances_are_those_of_the_geometry(moves: str) -> None:
-    scene = load_description("mug", size=1.0, given={"camera.elevation": 0.0, "camera.distance": 2.0})
+    scene = load_description("mug", size=1.0, setting_values={"camera.elevation": 0.0, "camera.distance": 2.0})
     away = distance(bound(scene, path="orbit", moves=moves), 0.7)
     assert away == pytest.approx(2.0, abs=1e-4)
     near = [distance(bound(scene, path="approach", reach=5.0, moves=moves), share) for share in (0.0, 0.25, 1.0)]
@@ -142,7 +142,7 @@ def test_the_box_of_each_frame_is_where_both_have_moved_to(tmp_path: Path) -> No
 @pytest.mark.parametrize("path", PATHS)
 def test_moving_the_camera_or_the_object_is_the_same_drive(path: str) -> None:
     """Up to the sense of the turn: what the camera sees of the object's middle is as far away."""
-    scene = load_description("mug", size=1.0, given={"camera.elevation": 30.0})
+    scene = load_description("mug", size=1.0, setting_values={"camera.elevation": 30.0})
     camera, thing = (bound(scene, path=path, moves=moves) for moves in ("camera", "object"))
     for share in (0.0, 0.4, 0.8):
         assert distance(camera, share) == pytest.approx(distance(thing, share), rel=1e-4)
@@ -222,10 +222,10 @@ def test_a_path_through_what_the_camera_looks_at_is_refused(
 
 
 def test_a_path_through_what_it_looks_at_is_refused_where_no_file_is(tmp_path: Path) -> None:
-    level = load_description("mug", size=1.0, given={"camera.elevation": 0.0})
+    level = load_description("mug", size=1.0, setting_values={"camera.elevation": 0.0})
     file = tmp_path / "car.csv"
     file.write_text("time,x,y,z\n0,-9,0,0\n1,9,0,0\n")  # past the middle; the camera is at +x, and looks at the object
-    east = load_description("mug", size=1.0, given={"camera.elevation": 0.0, "camera.azimuth": 0.0})
+    east = load_description("mug", size=1.0, setting_values={"camera.elevation": 0.0, "camera.azimuth": 0.0})
     with pytest.raises(InputError, match="the camera is where it looks"):
         bound(east, path=f"approach+{file}")
     for path in (*PATHS, "approach+orbit", "pass+pass"):

@@ -61,7 +61,7 @@ def smooth(renderer: Renderer, seed: int) -> Tensor:
 def test_white_puts_its_lumens_over_its_area_on_what_faces_it() -> None:
     """White ground below a projector in the dark: radiance = E(ambient) / pi x lux / ambient lux."""
     scene = load_description(
-        "mug", DARK, given={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0}
+        "mug", DARK, setting_values={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0}
     )
     control = ProjectorControl(elevation=89, distance=3 * scene.metres, fov=20, lumens=5, ambient=50, resolution=4)
     prepared = control.prepare(scene)

@@ -63,7 +63,7 @@ def test_it_is_out_of_sight_from_wherever_it_stands_or_put_away(azimuth: float, 
 def test_the_strongest_light_is_that_of_the_map_or_a_lamp() -> None:
     low, far = find_strongest_light(load_description("mug", "low-sun"))
     assert math.isinf(far) and 0.0 < low[2] < 0.5 and np.linalg.norm(low) == pytest.approx(1.0, abs=1e-3)
-    turned, _ = find_strongest_light(load_description("mug", "low-sun", given={"environment.rotation": 90.0}))
+    turned, _ = find_strongest_light(load_description("mug", "low-sun", setting_values={"environment.rotation": 90.0}))
     assert turned[0] == pytest.approx(-low[1], abs=1e-6) and turned[1] == pytest.approx(low[0], abs=1e-6)
 
 

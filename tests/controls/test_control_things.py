@@ -27,11 +27,11 @@ CLOSE = 2e-4
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return load_description("car", things=THINGS, given={"camera.distance": 9.0})
+    return load_description("car", things=THINGS, setting_values={"camera.distance": 9.0})
 
 
 def test_a_thing_that_moves_stays_out_of_houses_and_posts() -> None:
-    street = load_description("car", "avenue", things="person@-15,-6", given={"camera.distance": 9.0})
+    street = load_description("car", "avenue", things="person@-15,-6", setting_values={"camera.distance": 9.0})
     space = space_of(street, {"x": [-0.1, 0.1], "y": [-12.0, 3.0], "heading": [0, 1]})
     solids = [solid for part in street.surrounding_meshes.values() for solid in part.solids]
     for u in torch.rand(40, len(space.start), generator=torch.Generator().manual_seed(1)):
@@ -97,7 +97,7 @@ def test_where_it_stands_is_said_as_things_are_asked_for(scene: SceneDescription
     said = space.describe(u)
     x, y = (said[f"things.chair.at_{axis}"]["value"] for axis in "xy")
     assert said["things.chair.x"]["value"] == -2.0 and float(x) > 2.3
-    again = load_description("car", things=f"chair@{x},{y},size=1,heading=40", given={"camera.distance": 9.0})
+    again = load_description("car", things=f"chair@{x},{y},size=1,heading=40", setting_values={"camera.distance": 9.0})
     placed = Assembly(again).meshes["chair"].transform_mesh(None, None)[0].double().numpy() * again.metres
     np.testing.assert_allclose(vertices(space, u, "chair"), placed, atol=5e-3)  # the car's middle is not its box's foot
 
@@ -140,7 +140,9 @@ def test_the_object_and_other_things_may_be_moved_by_other_controls(scene: Scene
 
 def test_nothing_stands_where_the_camera_is() -> None:
     scene = load_description(
-        "car", things="car@11,5", given={"camera.distance": 11.0, "camera.azimuth": 0.0, "camera.elevation": 3.0}
+        "car",
+        things="car@11,5",
+        setting_values={"camera.distance": 11.0, "camera.azimuth": 0.0, "camera.elevation": 3.0},
     )
     space = space_of(scene, {"y": [-5.0, 0.0]})
     placed = compute_footprint(vertices(space, torch.tensor([0.0]), "car"))

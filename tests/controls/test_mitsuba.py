@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.cli.flags import config_from
+from advsearch.cli.flags import make_config
 from advsearch.cli.main import _parse
 from advsearch.controls import make_space
 from advsearch.engine.gradients import make_smooth_loss
@@ -133,7 +133,7 @@ def test_the_command_line_gathers_ranges_by_key() -> None:
     words = ["attack", "--scene", "box.xml", "--object", "large-box"]
     words += ["--control", f"pose,mitsuba:{RED}=[0.1,0.9]", "--control", f"mitsuba:{WIDE}=40"]
     args = _parse(words, "attack")
-    config = config_from(args, AttackConfig)
+    config = make_config(args, AttackConfig)
     assert config.controls == {"pose": {}, "mitsuba": {RED: [0.1, 0.9], WIDE: 40}}
 
 

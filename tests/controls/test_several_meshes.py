@@ -106,7 +106,7 @@ def test_names_that_are_none_are_refused(scene: SceneDescription) -> None:
     with pytest.raises(UnknownNameError, match=r"unknown scene parameter 'pose:post.yaww'"):
         Scene(scene).with_settings({"pose:post.yaww": 3.0})
     with pytest.raises(UnknownNameError, match=r"unknown mesh around the object 'post'"):
-        load_description("mug", given={"pose:post.yaw": 3.0})
+        load_description("mug", setting_values={"pose:post.yaw": 3.0})
     for kind in ("patch", "light", "camera"):
         with pytest.raises(InputError, match=rf"`controls` {kind}:post: {kind} can't be given to another mesh"):
             make_space([make_control(f"{kind}:post")], scene)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import format_result as text_of
 from advsearch.errors import InputError
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.run import attack_once
@@ -27,7 +27,7 @@ SMALL: dict[str, Any] = {
 def rows(run: Path) -> list[Row]:
     """What a run has stored, but for times and machines."""
     with Store(run / "results.sqlite", read_only=True) as store:
-        found = [row for kind in store.counts() for row in store.rows(kind)]
+        found = [row for kind in store.count_by_kind() for row in store.rows(kind)]
     return [replace(row, seconds=None, time=None, machine=None, id=None) for row in found]
 
 
@@ -147,5 +147,7 @@ def test_workers_try_a_picture_in_other_ambient_light(tmp_path: Path, monkeypatc
     assert result.summary.ambient is not None and result.summary.ambient == alone.summary.ambient
     assert rows(tmp_path / "run") == rows(tmp_path / "alone")
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
-        machines = {kind: {row.machine for row in store.rows(kind)} for kind in store.counts() if kind.endswith(" lux")}
+        machines = {
+            kind: {row.machine for row in store.rows(kind)} for kind in store.count_by_kind() if kind.endswith(" lux")
+        }
     assert len(machines) >= 4 and all("ab12" in one for one in machines.values()), machines

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Proposal, get_objective, search
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, ObjectiveKind
 from advsearch.controls import CONTROLS, NumberControl, Parameter, compose
-from advsearch.copies import copied
+from advsearch.copies import copy_value
 from advsearch.engine.judging import judge_images
 from advsearch.engine.loading import load_scene, make_controls
 from advsearch.errors import InputError
@@ -257,7 +257,9 @@ def test_what_a_space_hands_out_may_be_destroyed(kind: str) -> None:
     scenes: dict[str, Any] = {"body": {"object": "person"}, "things": {"object": "mug", "things": "bottle@0.4,0.1"}}
     space = compose(make_controls([kind]), load_scene(**scenes[kind]).description if kind in scenes else MUG)
     u = space.start.clone()
-    first = {ask: copied(getattr(space, ask)(u)) for ask in ("inputs", "get_printable_colors", "get_numeric_values")}
+    first = {
+        ask: copy_value(getattr(space, ask)(u)) for ask in ("inputs", "get_printable_colors", "get_numeric_values")
+    }
     for ask in first:
         destroy(getattr(space, ask)(u))
     destroy(space.start)
@@ -348,11 +350,11 @@ def test_what_is_copied() -> None:
         "a": [at * 2.0, np.zeros(2)],
         "b": (SimpleNamespace(c=torch.zeros(1)), Evaluation(1.0, torch.ones(1), True)),
     }
-    found = copied(value)
+    found = copy_value(value)
     destroy(found)
     assert [one.tolist() for one in value["a"]] == [[2.0, 2.0], [0.0, 0.0]]
     held: Any
     evaluation: Any
     held, evaluation = value["b"]
     assert held.c.tolist() == [0.0] and evaluation.gradient.tolist() == [1.0]
-    assert copied([at * 2.0])[0].requires_grad and copied("text") == "text"
+    assert copy_value([at * 2.0])[0].requires_grad and copy_value("text") == "text"

@@ -15,7 +15,7 @@ from test_sweep_workers import Disorder, rows, summary
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import format_result as text_of
 from advsearch.engine.journal import make_worker_call
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress

@@ -13,7 +13,7 @@ from torch import Tensor
 from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult
 from advsearch.attacks.candidates import FailureRate, Failures, FoundFailure
 from advsearch.attacks.verification import OVER_CONDITIONS, TRIAL_LOOKS, Rule
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import format_result as text_of
 from advsearch.engine.journal import Journal, ParallelEvaluator
 from advsearch.engine.record import RunState
 from advsearch.engine.verifier import Verifier

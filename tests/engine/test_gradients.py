@@ -682,5 +682,5 @@ def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> N
     for row in single.values():
         assert None not in (row.noise, row.reference_error, row.bias) and math.isfinite(row.value or 0.0)
         assert row.status in ("ok", "noisy", "biased", "reference unusable")
-    text = " ".join(one.title for one in make_check_view(checked).sections if not one.empty)
+    text = " ".join(one.title for one in make_check_view(checked).sections if not one.is_empty)
     assert "Smooth linear loss" in text and "each parameter" in text and "cosine with the converged" in text

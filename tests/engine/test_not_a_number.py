@@ -18,7 +18,7 @@ from advsearch.errors import InputError
 from advsearch.options import Outcome
 from advsearch.questions.attack import wording
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.report.wording import calls, prediction_cells, tally
+from advsearch.report.wording import format_mistake, format_prediction_cells, format_tally
 from advsearch.tasks import Judgement, Prediction
 
 NOTHING = Judgement.of(math.nan, math.nan, Prediction("tench", 0, math.nan))
@@ -58,9 +58,9 @@ def test_the_headline_never_calls_it_right_or_wrong() -> None:
     assert "0 of 20 fresh" not in all_of_them.replace("none of 20", "")
     some = wording.attack_verdict(told(2, 5))
     assert "in 2 of 20 fresh renders (95 % interval 0-20 %), and in 5 its output is not a number." in some
-    assert tally("wrong", 0, 20, 20) == "not a number in 20 of 20"
-    assert tally("wrong", 2, 20, 5) == "wrong in 2, not a number in 5 of 20"
-    assert tally("wrong", 2, 20) == "wrong in 2 of 20"
+    assert format_tally("wrong", 0, 20, 20) == "not a number in 20 of 20"
+    assert format_tally("wrong", 2, 20, 5) == "wrong in 2, not a number in 5 of 20"
+    assert format_tally("wrong", 2, 20) == "wrong in 2 of 20"
 
 
 def test_a_clean_scene_without_a_number_is_said_as_such() -> None:
@@ -73,10 +73,11 @@ def test_a_clean_scene_without_a_number_is_said_as_such() -> None:
     assert "fails 3 of its 20 trials; in 2 the output is not a number." in first
     for task in ("classification", "detection", "segmentation", "depth"):
         assert (
-            calls(task, "this mug", "not a number") == "predicts nothing for this mug, for its output is not a number"
+            format_mistake(task, "this mug", "not a number")
+            == "predicts nothing for this mug, for its output is not a number"
         )
-        assert prediction_cells(task, Prediction("not a number")) == ["not a number", ""]
-    assert calls("segmentation", "this bottle", "no bottle", Outcome.MISSED) == "finds no bottle"
+        assert format_prediction_cells(task, Prediction("not a number")) == ["not a number", ""]
+    assert format_mistake("segmentation", "this bottle", "no bottle", Outcome.MISSED) == "finds no bottle"
 
 
 class Broken(nn.Module):

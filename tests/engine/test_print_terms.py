@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import format_result as text_of
 from advsearch.engine.judging import mean_variation, printable_distance
 from advsearch.errors import InputError
 from advsearch.progress import Stages

@@ -28,7 +28,7 @@ from advsearch.questions.stability.result import StabilityConfig
 from advsearch.runs import files
 from advsearch.runs.directory import RunDirectory, read_python_only
 from advsearch.runs.listing import can_resume
-from advsearch.runs.store import Row, Store, Told
+from advsearch.runs.store import CachedEvaluation, Row, Store
 from advsearch.settings import Config, PythonOnly
 from conftest import ROOT
 from covering import only
@@ -163,7 +163,7 @@ CHANGES: dict[str, Any] = {
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_run_goes_on_with_the_settings_that_it_began_with(tmp_path: Path, name: str) -> None:
     with RunDirectory.create(tmp_path / "run", config=configuration()) as run:
-        run.record(Row(kind="search", step=0))
+        run.append_rows(Row(kind="search", step=0))
     recipe = tmp_path / "run" / "run.yaml"
     edited = AttackConfig.from_yaml(recipe, {name: CHANGES[name]})
     with pytest.raises(InputError, match=rf"with something else than the run began with: {name}\b.*; restore it"):
@@ -201,9 +201,9 @@ def test_a_sitting_may_be_longer_than_the_one_before(tmp_path: Path, config: Con
 @pytest.mark.parametrize(("note", "got"), [(None, "none"), ("[1,", ".*damaged"), ("[1]", "list")])
 def test_a_run_without_its_settings_does_not_go_on(tmp_path: Path, note: str | None, got: str) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
-        run.record(Row(kind="search", step=0))
+        run.append_rows(Row(kind="search", step=0))
         if note is not None:
-            run.store.set_note("settings", note)
+            run.store.write_note("settings", note)
     with pytest.raises(FileFormatError, match=f"results.sqlite: expected .*, got {got}"):
         RunDirectory.resume(tmp_path / "run", configuration())
 
@@ -212,22 +212,22 @@ def test_what_a_search_was_told_comes_back_bit_for_bit_until_the_run_is_done(tmp
     gradient, picture = np.arange(5, dtype=np.float32) / np.float32(3), np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
     row = Row("search", 0, objective=0.1 + 0.2, margin=-2.5, correct=True, payload={"boxes": [[0.1, 2]]})
     with Store(tmp_path / "results.sqlite") as store:
-        store.append([row], Told(3, b"12", 0, 2, gradient, picture))
-        store.append([replace(row, step=1)], Told(4, b"13", 1, 1))
+        store.append([row], CachedEvaluation(3, b"12", 0, 2, gradient, picture))
+        store.append([replace(row, step=1)], CachedEvaluation(4, b"13", 1, 1))
         store.append([replace(row, kind="control")])
-        assert store.goes_on and store.told("search", 2) is None and store.told("control", 0) is None
-        stored = store.told("search", 0)
+        assert store.has_cached and store.read_cached("search", 2) is None and store.read_cached("control", 0) is None
+        stored = store.read_cached("search", 0)
         assert stored is not None
         again, told = stored
         assert (again.objective, again.margin, again.payload) == (0.1 + 0.2, -2.5, row.payload)
         assert told.gradient is not None and np.array_equal(told.gradient, gradient)
         assert told.picture is not None and np.array_equal(told.picture, picture)
         assert (told.number, told.u, told.cost) == (3, b"12", 2)
-        assert [number for number, _ in store.pictures("search", 0, 9)] == [3]
+        assert [number for number, _ in store.iterate_images("search", 0, 9)] == [3]
         store.append([row, replace(row, step=2)])
-        assert store.told("search", 2) is None, "it was told nothing"
-        store.forget()
-        assert store.told("search", 0) is None and store.count() == 4
+        assert store.read_cached("search", 2) is None, "it was told nothing"
+        store.delete_cached()
+        assert store.read_cached("search", 0) is None and store.count_rows() == 4
     assert not can_resume(tmp_path)
 
 
@@ -295,7 +295,7 @@ def test_a_run_that_was_killed_before_it_had_results_goes_on(tmp_path: Path) -> 
         pass
     (folder / "results.sqlite").unlink()
     with RunDirectory.resume(folder, configuration()) as run:
-        assert run.store.noted("settings") == configuration().get_deciding_settings()
+        assert run.store.read_json_note("settings") == configuration().get_deciding_settings()
     with closing(sqlite3.connect(tmp_path / "results.sqlite")) as made:
         made.execute(f"PRAGMA application_id = {files.APPLICATION_ID}")
         made.execute("CREATE TABLE others (text)")

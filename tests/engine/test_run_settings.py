@@ -8,7 +8,7 @@ import pytest
 
 import advsearch
 from advsearch.api import render as rendering
-from advsearch.cli.flags import with_flags
+from advsearch.cli.flags import format_as_flags
 from advsearch.cli.main import main
 from advsearch.config import RenderConfig
 from advsearch.controls import CONTROLS, make_control
@@ -167,7 +167,7 @@ def test_a_control_alone_gets_what_it_takes() -> None:
 def test_a_setting_that_no_control_takes_is_refused(controls: Any, options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError) as error:
         check_run_settings(AttackConfig(object="mug", controls=controls, **options))
-    assert with_flags(str(error.value)).startswith(message)
+    assert format_as_flags(str(error.value)).startswith(message)
 
 
 @pytest.mark.parametrize(
@@ -220,7 +220,7 @@ def test_an_epsilon_for_a_control_that_is_not_there_is_refused() -> None:
         try:
             check_run_settings(AttackConfig(object="mug", epsilon="texure=1"))
         except UnknownNameError as error:
-            error.args = (with_flags(str(error)),)
+            error.args = (format_as_flags(str(error)),)
             raise
 
 

@@ -16,7 +16,7 @@ from advsearch.cluster import InProcess
 from advsearch.engine.journal import Journal, ParallelEvaluator, make_lost_evaluation, make_worker_call
 from advsearch.errors import ClusterError
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.store import Row, Told
+from advsearch.runs.store import CachedEvaluation, Row
 from conftest import ROOT
 from stand_ins import StandInProblem, StandInWorkers
 
@@ -74,14 +74,17 @@ def test_what_is_in_the_journal_is_not_asked_again(tmp_path: Path) -> None:
         stopped = journal.evaluate_all(queries(8), evaluate)
         for _ in range(6):
             next(stopped)
-        assert run.store.count("average") == 6, "a row is kept before its answer is seen, and no more is asked for"
+        assert run.store.count_rows("average") == 6, "a row is kept before its answer is seen, and no more is asked for"
 
 
 def test_reading_back_takes_none_of_the_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr("time.perf_counter", lambda: now)
     with RunDirectory.create(tmp_path / "run") as run:
-        run.record(*(Row("search", step, seconds=1.0, phase="search") for step in range(3)), told=Told(2, b"", 0, 1))
+        run.append_rows(
+            *(Row("search", step, seconds=1.0, phase="search") for step in range(3)),
+            cached=CachedEvaluation(2, b"", 0, 1),
+        )
         late = Journal(run, ParallelEvaluator(StandInProblem())).make_time_check("search", 3.5)  # type: ignore[arg-type]
         assert late is not None and not late(1)
         now += 0.4

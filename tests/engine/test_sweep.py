@@ -27,9 +27,9 @@ from torch import Tensor, nn
 import advsearch
 import small_models
 from advsearch.attacks.domain import NET, ProductIndex, SampleSequence, SeedSequence, split_into_batches
-from advsearch.cli.flags import help_text, with_flags
+from advsearch.cli.flags import format_as_flags, format_help
 from advsearch.cli.main import ExperimentCommand, main
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import format_result as text_of
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.judging import make_domain
@@ -43,9 +43,9 @@ from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
-from advsearch.report.wording import formation_text
+from advsearch.report.wording import format_formation
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results import plain
+from advsearch.runs.results import to_json_value
 from advsearch.runs.store import Row
 from advsearch.runs.summary import write_configuration
 from advsearch.runs.tables import read_sweep
@@ -426,7 +426,7 @@ def test_what_a_row_says_of_an_occluder_is_true_of_its_own_camera() -> None:
     assert near == pytest.approx(1.0, abs=0.1) and far == pytest.approx(2.0, abs=0.1)
     rows = {row.step: row for row in found.rows()}
     assert (worst := found.summary.worst) is not None
-    assert plain(worst.values) == rows[worst.configuration].values
+    assert to_json_value(worst.values) == rows[worst.configuration].values
 
 
 def test_a_model_that_comes_with_the_name_of_another_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -507,7 +507,7 @@ def test_each_room_has_its_own_gain_and_ranges_are_the_declared_ones() -> None:
     assert rooms.gains == pytest.approx({f"mug, {name}": gain for name, gain in own.items()})
     assert own["studio"] != pytest.approx(own["noon"], rel=1e-3)
     assert rooms.image_formation and rooms.image_formation.gain is None
-    said = formation_text(rooms.image_formation, rooms.gains)
+    said = format_formation(rooms.image_formation, rooms.gains)
     assert said.endswith(f"a gain for each scene: mug, studio {own['studio']:.4g}; mug, noon {own['noon']:.4g}")
     one = advsearch.sweep("mug", model(), environment="noon", controls=drawn, samples=3).summary
     assert one.image_formation and one.image_formation.gain == 1.0 and one.gains is None, "of the stand-in"
@@ -571,7 +571,7 @@ def test_the_worst_is_the_smallest_margin_and_is_rendered_again(tmp_path: Path) 
     assert worst is not None and worst.verified is not None
     best = max(rows, key=lambda row: row.score or -math.inf)
     assert worst.configuration == best.step and worst.claimed.margin == -(best.score or 0.0)
-    assert plain(worst.values) == best.values and worst.seed == best.seed and worst.claimed.label == "vase"
+    assert to_json_value(worst.values) == best.values and worst.seed == best.seed and worst.claimed.label == "vase"
     checked = worst.verified
     assert (checked.successes, checked.trials, checked.spp) == (7, 7, 36) and checked.labels == {"vase": 7}
     with RunDirectory.resume(tmp_path / "run") as run:
@@ -836,7 +836,7 @@ def test_what_is_no_list_of_values_is_refused(given: Any) -> None:
 def test_a_wrong_setting_names_its_flag(name: str, value: Any, message: str) -> None:
     with pytest.raises(InputError) as error:
         SweepConfig(**{"object": "mug", name: value})
-    assert with_flags(str(error.value)) == message
+    assert format_as_flags(str(error.value)) == message
 
 
 def test_the_recipe_repeats_the_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -953,7 +953,7 @@ def test_every_flag_of_its_own_is_documented() -> None:
     page = (DOCS / "command-line.md").read_text("utf-8").partition("\n## sweep\n")[2].partition("\n## ")[0]
     for one in settings(SweepConfig):
         if one.group in ("sweep", "verification") and one.field != "spp":
-            what, _, rest = help_text(one).partition(": ")
+            what, _, rest = format_help(one).partition(": ")
             values, _, default = rest.partition(" (default: ")
             assert f"| `{one.flag}` | {what} | {values or 'no value'} | {default.removesuffix(')')} |" in page
 

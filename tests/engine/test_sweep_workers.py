@@ -13,7 +13,7 @@ from test_sweep import FakeRenderer
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import format_result as text_of
 from advsearch.cluster import BatchFunction, BatchResult, WorkerStats
 from advsearch.engine.journal import make_worker_call
 from advsearch.engine.record import LOST_LABEL
@@ -129,7 +129,7 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
     with RunDirectory.create(tmp_path / "run") as run:
         executor = Two(make_worker_call(SceneLoader(job).load_by_name), stats=stats)
         result = Sweep(job, run, NullProgress(), executor).execute()
-        assert run.store.noted("machines") == {"ab12": {"processor": "another", "LLVM": "19.1"}}
+        assert run.store.read_json_note("machines") == {"ab12": {"processor": "another", "LLVM": "19.1"}}
     assert [row.machine for row in result.rows()] == ["ab12"] * 4 + [None] * 8
     told = "not alike, so that their last bits may differ; beside the one that kept the run: processor another, LLVM 19"
     assert any(told in text for text in result.summary.warnings)

@@ -83,9 +83,9 @@ def load_labels(path: Path) -> None:
 
 def load_settings(path: Path) -> None:
     """Read a YAML file as `advsearch run` does."""
-    from advsearch.cli.flags import command_in, config_of_file
+    from advsearch.cli.flags import read_command, read_file_config
 
-    config_of_file(command_in(path), path, {})
+    read_file_config(read_command(path), path, {})
 
 
 def load_run(path: Path) -> None:
@@ -94,10 +94,10 @@ def load_run(path: Path) -> None:
 
     from advsearch.cli.show import show_run
     from advsearch.runs.export import write_rows
-    from advsearch.runs.listing import listed_run
+    from advsearch.runs.listing import read_listed_run
     from advsearch.runs.store import NAME, Store
 
-    listed_run(path.parent)
+    read_listed_run(path.parent)
     with Store(path.parent / NAME, read_only=True) as store:
         write_rows(store, "json", None, io.BytesIO())
     show_run(str(path.parent), as_json=False)
@@ -145,7 +145,7 @@ def load_whole_run(kind: str, path: Path) -> None:
 
     run = path.parent
     warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the reader itself has a smaller limit
-    fault = listing.listed_run(run).fault
+    fault = listing.read_listed_run(run).fault
     said = [fault] if fault else []
     Path("made").mkdir(exist_ok=True)
     try:

@@ -69,7 +69,9 @@ def _long_sweep(path: Path) -> None:
                 "light.power": {"value": power, "unit": "1"},
             }  # fmt: skip
             wrong = yaw > 45
-            run.record(Row("sweep", step, correct=not wrong, margin=1.0 if wrong else -1.0, label="mug", values=values))
+            run.append_rows(
+                Row("sweep", step, correct=not wrong, margin=1.0 if wrong else -1.0, label="mug", values=values)
+            )
 
 
 MADE: dict[str, Callable[[Path], object]] = {

@@ -26,7 +26,7 @@ from advsearch.errors import InputError, ModelError
 from advsearch.models import address
 from advsearch.models.address import AddressModel
 from advsearch.tasks import make_task
-from advsearch.trust.code import nothing_allowed
+from advsearch.trust.code import restrict_allowed_code
 from advsearch.trust.network import KEY, check_address, is_local
 
 SECRET = "sk-very-secret"
@@ -356,7 +356,7 @@ def test_an_address_that_only_a_file_names_is_asked_nothing(
 ) -> None:
     file = tmp_path / "run.yaml"
     file.write_text(f"object: mug\nmodel: {server.url}\n")
-    with nothing_allowed():
+    with restrict_allowed_code():
         assert main(["run", str(file), "--quiet"]) == 2
     assert f"a file names the model {server.url}" in capsys.readouterr().err
     assert not server.came
@@ -479,7 +479,7 @@ def test_an_attack_that_is_stopped_by_a_limit_goes_on_and_asks_nothing_twice(
     server.came.clear()
     assert main([*command, "--run", "part", "--ask", "calls=7"]) == 2
     assert "7 calls are spent, and --ask allows 7" in capsys.readouterr().err and len(server.came) == 7
-    with nothing_allowed():
+    with restrict_allowed_code():
         assert main(["resume", "part", "--quiet"]) == 2
         assert "--code" in capsys.readouterr().err
         assert main(["resume", "part", "ask.calls=99", "--code", server.url, "--quiet", "--json"]) == 0

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.models import load_model
 from advsearch.trust.code import allow_code
-from advsearch.trust.foreign_code import PLAIN, Switches, plainly
+from advsearch.trust.foreign_code import PLAIN, Switches, use_plain_switches
 
 TURNED = {
     "type": Switches(dtype=torch.float64),
@@ -26,7 +26,7 @@ TURNED = {
 @pytest.fixture(autouse=True)
 def turned_back() -> Iterator[None]:
     yield
-    PLAIN.turn()
+    PLAIN.apply()
 
 
 class OfItsType(nn.Module):
@@ -47,16 +47,20 @@ class OfItsType(nn.Module):
 @pytest.mark.parametrize("turned", TURNED)
 def test_a_model_is_loaded_and_asked_whatever_is_turned(turned: str) -> None:
     theirs = TURNED[turned]
-    theirs.turn()
+    theirs.apply()
     model = load_model(OfItsType(), input_size=16)
-    assert Switches.now() == theirs, "as they were"
+    assert Switches.read_current() == theirs, "as they were"
     assert model.differentiable and model.dtype == theirs.dtype
-    with plainly():
+    with use_plain_switches():
         picture = torch.full((16, 16, 3), 0.5, requires_grad=True)
         logits = model(picture)
         (gradient,) = torch.autograd.grad(logits.max(), picture)
-        assert logits.dtype == gradient.dtype == torch.float32 and bool(gradient.any()) and Switches.now() == PLAIN
-    assert Switches.now() == theirs
+        assert (
+            logits.dtype == gradient.dtype == torch.float32
+            and bool(gradient.any())
+            and Switches.read_current() == PLAIN
+        )
+    assert Switches.read_current() == theirs
 
 
 def test_what_the_code_of_a_network_turns_stays_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,8 +72,8 @@ def test_what_the_code_of_a_network_turns_stays_with_it(tmp_path: Path, monkeypa
     monkeypatch.syspath_prepend(tmp_path)
     allow_code("turning_nets:make")
     model = load_model("turning_nets:make", input_size=16)
-    assert Switches.now() == PLAIN and model.dtype == torch.float64 and model.differentiable
-    assert model(torch.zeros(16, 16, 3)).dtype == torch.float32 and Switches.now() == PLAIN
+    assert Switches.read_current() == PLAIN and model.dtype == torch.float64 and model.differentiable
+    assert model(torch.zeros(16, 16, 3)).dtype == torch.float32 and Switches.read_current() == PLAIN
 
 
 def test_a_network_that_switches_gradients_off_as_it_runs_does_so_for_itself() -> None:
@@ -90,12 +94,12 @@ def test_networks_in_other_types_are_warned_of_by_nothing(dtype: torch.dtype) ->
 
 @pytest.mark.medium
 def test_a_scene_is_rendered_and_searched_whatever_is_turned() -> None:
-    TURNED["all"].turn()
+    TURNED["all"].apply()
     network = OfItsType()
     with torch.no_grad():
         network.last.bias[0] += 5.0
     named = load_model(network, input_size=16, labels=["mug", "bowl", "vase"])
     assert advsearch.render("mug", named, spp=1).views[0].predictions[0].label == "mug"
     result = advsearch.attack("mug", named, steps=2, spp=1, trials=6, verify_spp=1, baseline=False)
-    assert Switches.now() == TURNED["all"]
+    assert Switches.read_current() == TURNED["all"]
     assert result.summary.ending == "budget spent" and result.summary.renders["gradient"] > 0

@@ -21,7 +21,7 @@ from advsearch.errors import FileFormatError, ModelError, UnknownNameError
 from advsearch.models import ModelWarning, load_model
 from advsearch.models.zoo.library import report_library_errors
 from advsearch.tasks import Detection
-from advsearch.trust.code import allow_named, nothing_allowed
+from advsearch.trust.code import allow_named, restrict_allowed_code
 from fuzz import onnx_files
 
 IMAGES = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
@@ -209,7 +209,7 @@ def timm(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def test_a_model_that_only_a_file_names_is_fetched_from_nowhere() -> None:
     """Whatever a library does to reach a server; what it has in its cache is read all the same."""
-    with socket.create_server(("127.0.0.1", 0)) as server, nothing_allowed():
+    with socket.create_server(("127.0.0.1", 0)) as server, restrict_allowed_code():
 
         def fetch() -> None:
             socket.create_connection(server.getsockname(), 10.0).close()

@@ -28,7 +28,7 @@ from advsearch.questions.check import check
 from advsearch.questions.check import result as words
 from advsearch.questions.check.result import CheckConfig, CheckedRow, CheckResult, GainRow
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.listing import finished, listed_runs
+from advsearch.runs.listing import is_finished, list_runs
 from advsearch.runs.measurements import Measurements, OutOfTime
 from advsearch.runs.results import PathLength, Result
 from advsearch.runs.summary import read_result
@@ -83,11 +83,11 @@ def test_ctrl_c_leaves_rows_and_resume_ends_with_the_same(
     stopped = kept(folder)
     assert stopped.ending == "interrupted" and 1 <= len(stopped.rows) < len(whole.rows)
     assert values(stopped) == values(whole)[: len(stopped.rows)]
-    assert listed_runs(tmp_path)[0].state == "stopped"
+    assert list_runs(tmp_path)[0].state == "stopped"
     main(["resume", str(folder), "--json"])
     answer = CheckResult.of(json.loads(capfd.readouterr().out))
     assert answer.ending == "done" and values(answer) == values(whole)
-    assert finished(folder) and kept(folder).to_dict() == answer.to_dict()
+    assert is_finished(folder) and kept(folder).to_dict() == answer.to_dict()
 
 
 @pytest.mark.slow
@@ -142,10 +142,10 @@ def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
     folder = tmp_path / "run"
     config = CheckConfig(**SMALL, seconds=0.001, run=str(folder))
     summary = check.run(config)
-    assert summary.ending == "out of time" and not finished(folder)
+    assert summary.ending == "out of time" and not is_finished(folder)
     # a sitting that is longer
     monkeypatch.setattr(RunContext, "open_measurements", lambda context, seconds=None: Measurements(context))
-    assert values(check.run(config, resumed=folder)) == values(whole) and finished(folder)
+    assert values(check.run(config, resumed=folder)) == values(whole) and is_finished(folder)
     assert main(["show", str(folder)]) == 0
     assert words.READING in capsys.readouterr().out
 
@@ -239,19 +239,19 @@ def test_a_check_that_is_stopped_anywhere_goes_on_to_the_same_plan(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = check.run(CheckConfig(**PLANNED, run=str(tmp_path / "whole")))
-    assert whole.ending == "done" and finished(tmp_path / "whole")
+    assert whole.ending == "done" and is_finished(tmp_path / "whole")
     assert whole.gains and whole.bounces is not None and whole.plan is not None and whole.plan.left_out
     config, folder, before = CheckConfig(**PLANNED, run=str(tmp_path / "run")), tmp_path / "run", 0
     for number, stop in enumerate((Stop(1), Stop(2), Stop(stage="saves"), Stop(stage="gradients for camera"))):
         stopped = check.run(config, progress=stop, resumed=folder if number else None)
-        assert stopped.ending == "interrupted" and not finished(folder)
+        assert stopped.ending == "interrupted" and not is_finished(folder)
         assert len(stopped.rows) > before or stopped.bounces is not None
         assert timeless(kept(folder)) == timeless(stopped)
         before = len(stopped.rows)
     INTERRUPTS.count = 0
     assert main(["resume", str(folder), "--json", "--quiet"]) in (0, 3)
     resumed = CheckResult.of(json.loads(capsys.readouterr().out))
-    assert timeless(resumed) == timeless(whole) == timeless(kept(folder)) and finished(folder)
+    assert timeless(resumed) == timeless(whole) == timeless(kept(folder)) and is_finished(folder)
     assert main(["show", str(folder)]) == 0
     text = capsys.readouterr().out
     assert "How a search gets its derivatives" in text and "What that saves" in text

@@ -25,7 +25,7 @@ from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.runs.summary import read_result
-from advsearch.runs.tables import EDGES
+from advsearch.runs.tables import EDGES_NOTE
 from advsearch.statistics.paired import mcnemar, paired_difference
 from advsearch.viewer import thumbnails
 from samples import make_run, sweep
@@ -71,7 +71,7 @@ def stored(
     halves = ("clean", Path(config.adversarial_of).name) if config.adversarial_of else ("",)
     rows = []
     with RunDirectory.create_for(config) as run:
-        run.store.set_note(EDGES, json.dumps({"camera.elevation": EDGES_OF_ELEVATION}))
+        run.store.write_note(EDGES_NOTE, json.dumps({"camera.elevation": EDGES_OF_ELEVATION}))
         for half, answer in enumerate(halves):
             for number, (height, luck) in enumerate(draws):
                 elevation = lowest + 80.0 * height
@@ -91,7 +91,7 @@ def stored(
                         Row("sweep", place * len(models) + model, correct=is_right, values=values, seconds=0.25,
                             margin=1.0 if is_right else -1 - luck, label="mug" if is_right else "bowl")
                     )  # fmt: skip
-        run.record(*rows, Row("verification", 0, correct=False, label="bowl"))
+        run.append_rows(*rows, Row("verification", 0, correct=False, label="bowl"))
         right_ones = sum(bool(one.correct) for one in rows)
         counts = {"configurations": len(rows), "correct": right_ones, "accuracy": right_ones / len(rows)}
         run.write_summary(

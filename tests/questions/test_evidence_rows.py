@@ -22,7 +22,7 @@ from advsearch.questions.report.evidence import (
     list_triggering_conditions,
     read_exposure,
 )
-from advsearch.report.wording import interval_text, percent
+from advsearch.report.wording import format_interval, percent
 from advsearch.runs.store import NAME, Store
 from advsearch.statistics.intervals import clopper_pearson
 from stored_sweeps import make_sweep
@@ -69,7 +69,7 @@ def test_every_share_is_that_of_the_rows(tmp_path: Path, capsys: pytest.CaptureF
     text, page = ((out / f"evidence.{kind}").read_text() for kind in ("md", "html"))
     for one in run["conditions"]:
         cells = [one["condition"].replace("_", "\\_"), str(one["right"]), str(one["of"])]
-        assert f"| {' | '.join(cells)} | {interval_text(one['interval'])} |" in text
+        assert f"| {' | '.join(cells)} | {format_interval(one['interval'])} |" in text
     for said in ("another grid gives another share", "Not shown", "A. N. Other", "denoise: none"):
         assert said in text and said in page
     assert run["domain"]["weather"] == "as each environment has it" and "studio" in run["domain"]["place"]

@@ -64,7 +64,7 @@ def stored(path: Path, wrong: Any, rows: int = 600, model: str = "reference", se
             }
             label = "bowl" if is_wrong else "mug"
             made.append(Row("sweep", step, correct=not is_wrong, margin=0.5, label=label, values=values))
-        run.record(*made, *(Row("verification", step, correct=False, label="bowl") for step in range(20)))
+        run.append_rows(*made, *(Row("verification", step, correct=False, label="bowl") for step in range(20)))
         right = sum(bool(one.correct) for one in made)
         counts = {"configurations": rows, "correct": right, "accuracy": right / rows, "interval": (0.0, 1.0)}
         run.write_summary(sweep(**counts, planned=rows, run=str(path)))

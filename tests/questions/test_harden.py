@@ -16,7 +16,7 @@ from safetensors import torch as safetensors
 import advsearch
 from advsearch.attacks import make_policy
 from advsearch.cli.main import main
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import format_result as text_of
 from advsearch.engine.loading import Scene
 from advsearch.engine.surface_light import find_surface_light_refusal
 from advsearch.errors import InputError, ModelError
@@ -195,7 +195,7 @@ def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple
     rows = [(0.9, 0.2), (0.89, 0.5), (0.87, 0.8), (0.885, 0.5)]
     with RunDirectory.create_for(config) as run:
         noted = [{"lessons": 1, "part": 1.0, "clean": clean, "robust": robust, "kept": False} for clean, robust in rows]
-        run.store.set_note(ROUNDS_NOTE, json.dumps(noted))
+        run.store.write_note(ROUNDS_NOTE, json.dumps(noted))
         for loss, best in ((0.02, 3), (0.05, 2), (0.0, 0)):
             course = course_of(config.model_copy(update={"clean_loss": loss}))
             assert Rounds(run, course).best == best

@@ -12,7 +12,7 @@ import torch
 
 from advsearch import attack, load_scene
 from advsearch.attacks import Query
-from advsearch.cli.output import shown_text as text_of
+from advsearch.cli.output import format_result as text_of
 from advsearch.controls import CameraControl, LightControl, MaterialControl, TextureControl
 from advsearch.engine.gradients import find_interior_point, make_smooth_loss
 from advsearch.engine.gradients.planning import MAX_CHANGE, measure_path_length

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from advsearch.cli.main import main
-from advsearch.cli.output import shown_text as precision_text
+from advsearch.cli.output import format_result as precision_text
 from advsearch.engine.gradients import make_smooth_loss
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
@@ -59,7 +59,7 @@ from advsearch.questions.precision.rule import (
     round_up_exactly,
     summarize_samples,
 )
-from advsearch.runs.listing import finished
+from advsearch.runs.listing import is_finished
 from advsearch.runs.summary import read_result
 from advsearch.scene.formation import round_sample_count
 from advsearch.scene.gradients import Group
@@ -600,12 +600,12 @@ def test_a_part_that_is_measured_is_kept_and_not_measured_again(
     stopped = precision.run(config, progress=Stop("gradient of environment: references"))
     assert stopped.ending == "interrupted" and {one.quantity for one in stopped.points} == {"picture", "margin"}
     kept = read_result(folder)
-    assert kept.to_dict() == stopped.to_dict() and not finished(folder)
+    assert kept.to_dict() == stopped.to_dict() and not is_finished(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measuring, "PictureBench", lambda *_: pytest.fail("measured again"))
         assert main(["resume", str(folder), "--json", "--quiet"]) == 0
     report = PrecisionResult.of(json.loads(capsys.readouterr().out))
-    assert report.ending == "done" and finished(folder) and len(report.figures) == 2
+    assert report.ending == "done" and is_finished(folder) and len(report.figures) == 2
     pictures = [one.to_dict() for one in report.points if one.quantity != "gradient"]
     assert pictures == [one.to_dict() for one in stopped.points]
     assert {one.quantity for one in report.points} == {"picture", "margin", "gradient"}

@@ -67,7 +67,7 @@ def test_an_adversarial_scene_is_rendered_again_under_every_condition(
     assert rows["integrator", "Mitsuba's path in place of prb"]["ending"] == "found"
     assert read_result(run).to_dict() == {**said, "table": [*said["table"][:-1], without, said["table"][-1]]}
     with Store(run / "results.sqlite", read_only=True) as store:
-        seeds = {tuple(row.seed for row in store.rows(kind)) for kind in store.counts()}
+        seeds = {tuple(row.seed for row in store.rows(kind)) for kind in store.count_by_kind()}
     assert len(seeds) == 1, "the same seeds under every condition"
     assert main(["show", str(run)]) == 0
     text = capsys.readouterr().out
@@ -91,7 +91,7 @@ def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, m
 
     monkeypatch.setattr(Problem, "judge", stopped)
     first = replay.run(config)
-    assert first.goes_on and len(first.table) == 1
+    assert first.is_unfinished and len(first.table) == 1
     again = replay.run(config, resumed=tmp_path / "run")
     assert again.ending == "done" and len(again.table) == 4 and done == 32 + 4 * 12 - 31
     assert again.table[0] == first.table[0]

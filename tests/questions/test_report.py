@@ -38,9 +38,9 @@ from advsearch.questions.report.recorded import RecordedSettings
 from advsearch.questions.report.result import Evidence, format_markdown, make_evidence_page
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig
-from advsearch.report.views import ENDED, NO_PROOF, NOTHING, Claim
+from advsearch.report.views import FAILED_SEARCH_ENDINGS, NO_PROOF, NOTHING_CLAIMED, Claim
 from advsearch.runs.results import Result
-from advsearch.runs.summary import bundled_digests, to_json
+from advsearch.runs.summary import compute_bundled_digests, to_json
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import Config, settings
 
@@ -78,7 +78,7 @@ def own(values: dict[str, Any]) -> list[RecordedSettings]:
 def nothing(claim: Claim) -> bool:
     """Whether a claim is none, in its kind, its words and its numbers at once."""
     said = claim.kind == "nothing claimed"
-    assert said == claim.statement.startswith(NOTHING) and said == (claim.extent is None)
+    assert said == claim.statement.startswith(NOTHING_CLAIMED) and said == (claim.extent is None)
     return said
 
 
@@ -92,18 +92,18 @@ def test_no_ending_makes_a_claim_that_the_trials_do_not_carry() -> None:
             assert not TOO_MUCH.search(claim.statement), claim.statement
             if nothing(claim):
                 continue
-            assert claim.extent is not None and not result.goes_on
+            assert claim.extent is not None and not result.is_unfinished
             if claim.kind == "found":
                 assert ending == "found" and rate and rate["successes"] == claim.extent.count == 20
             if claim.kind == "not found":
-                assert ending in ENDED and rate is not None and NO_PROOF in claim.statement
+                assert ending in FAILED_SEARCH_ENDINGS and rate is not None and NO_PROOF in claim.statement
                 assert re.search(r"Searched were \d+ renders by the policy \w+", claim.statement)
             assert (
                 f"{claim.extent.count} of {claim.extent.total}" in claim.statement
                 and "95 % interval" in claim.statement
             )
     assert {("found", "found"), ("not found", "stalled"), ("nothing claimed", "already wrong")} <= kinds
-    assert not [kind for kind in kinds if kind[0] == "not found" and kind[1] not in ENDED]
+    assert not [kind for kind in kinds if kind[0] == "not found" and kind[1] not in FAILED_SEARCH_ENDINGS]
 
 
 @pytest.mark.parametrize("ending", ["interrupted", "out of time"])
@@ -222,7 +222,7 @@ def test_predictions_of_several_models_to_the_same_pictures_are_not_counted_toge
 def test_a_run_notes_what_is_bundled_and_used_and_nothing_else() -> None:
     def bundled(config: Config) -> set[str]:
         known = {one.name for one in settings(type(config))}
-        return {*bundled_digests({name: value for name, value in config.to_json().items() if name in known})}
+        return {*compute_bundled_digests({name: value for name, value in config.to_json().items() if name in known})}
 
     model = "bundled model reference"
     assert bundled(AttackConfig(object="mug")) == {"bundled object mug", "bundled environment studio", model}

@@ -17,7 +17,7 @@ from advsearch.questions.recipe.result import RecipeConfig
 from advsearch.questions.report.evidence import QUICK
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.files import write_png
-from advsearch.runs.summary import MADE_WITH, file_digests
+from advsearch.runs.summary import VERSIONS_NOTE, compute_file_digests
 from samples import attack, make_run
 
 
@@ -79,19 +79,19 @@ def test_every_file_that_was_read_is_digested(tmp_path: Path) -> None:
     cube, whole = str(tmp_path / "a" / "cube.obj"), f"{tmp_path / 'b' / 'scene.gltf'}#thing"
     for spec in (cube, whole):
         advsearch.load_scene(spec)
-    found = file_digests({"object": f"{cube},{whole}", "environment": "studio"})
+    found = compute_file_digests({"object": f"{cube},{whole}", "environment": "studio"})
     read = [tmp_path / "a" / one for one in ("cube.obj", "cube.mtl", "paint.png")]
     read += [tmp_path / "b" / one for one in ("scene.gltf", "part.bin")]
     assert found == {str(one): sha256(one.read_bytes()).hexdigest() for one in read}
     (tmp_path / "a" / "paint.png").write_bytes(b"another")
-    assert file_digests({"object": cube})[str(read[2])] != found[str(read[2])]
+    assert compute_file_digests({"object": cube})[str(read[2])] != found[str(read[2])]
 
 
 def test_a_run_does_not_go_on_with_another_version(tmp_path: Path) -> None:
     config = AttackConfig(object="mug", run=str(tmp_path / "run"))
     with RunDirectory.create_for(config) as run:
-        first = run.store.noted(MADE_WITH)
-        run.store.set_note(MADE_WITH, json.dumps({**first, "torch": "0.1"}))
+        first = run.store.read_json_note(VERSIONS_NOTE)
+        run.store.write_note(VERSIONS_NOTE, json.dumps({**first, "torch": "0.1"}))
     with pytest.raises(InputError, match=r"than the run began with: torch \(was 0\.1\); restore it, or start again"):
         RunDirectory.resume(tmp_path / "run", config)
 

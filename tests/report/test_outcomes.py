@@ -18,11 +18,11 @@ from advsearch.questions.harden.result import HardenResult
 from advsearch.questions.sweep.page import verdict_text
 from advsearch.questions.sweep.result import OUTCOMES, Predictions, TableAxis
 from advsearch.questions.test.result import FAILED, describe_fraction, describe_trials, evaluate_search
-from advsearch.report.views import shown
-from advsearch.report.wording import wanted
+from advsearch.report.views import get_view
+from advsearch.report.wording import format_goal
 from advsearch.rules import count_wrong_outcomes
 from advsearch.runs.store import Row
-from advsearch.runs.tables import sweep_frame
+from advsearch.runs.tables import make_sweep_frame
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.depth import Depth
@@ -43,7 +43,7 @@ def test_a_goal_in_the_task_is_named_as_one_in_the_objective_is() -> None:
     """`detection={seek: create}` looks for what the objective `create` looks for, and not for a miss."""
     created = name_objective(Detection(seek="create"), "score")
     assert created == "create" == name_objective(Detection(), "create")
-    assert wanted(created, "this mug") == "makes the model see beside this mug what is not there"
+    assert format_goal(created, "this mug") == "makes the model see beside this mug what is not there"
     assert name_objective(Detection(), None) == "score" == name_objective(Depth(), "score")
     assert name_objective(Depth(seek="nearer"), None) == "nearer"
 
@@ -72,7 +72,7 @@ def test_a_clean_scene_that_fails_says_how() -> None:
 def test_a_sweep_says_how_the_others_fail() -> None:
     summary = sweep(task="detection", configurations=12, correct=7, accuracy=7 / 12, outcomes=COUNTS)
     assert f"of the others, {SAID}." in verdict_text(summary)
-    assert f"of the others, {SAID}." in shown(summary).said
+    assert f"of the others, {SAID}." in get_view(summary).statement
     assert "of the others" not in verdict_text(sweep(task="detection"))
 
 
@@ -98,11 +98,11 @@ def test_a_frame_of_rows_has_the_outcome() -> None:
         Row("sweep", number, correct=right, margin=0.0, label="x", payload={"outcome": outcome.value})
         for number, (right, outcome) in enumerate(kinds)
     ]
-    frame = sweep_frame(rows)
+    frame = make_sweep_frame(rows)
     assert list(frame["outcome"]) == ["found", "loose", "missed", "loose"]
     assert count_wrong_outcomes(frame) == {"loose": 2, "missed": 1}
     assert count_wrong_outcomes(pd.DataFrame({"correct": [0, 1]})) is None
-    plain = sweep_frame([Row("sweep", 0, correct=False, margin=0.0, label="vase")])
+    plain = make_sweep_frame([Row("sweep", 0, correct=False, margin=0.0, label="vase")])
     assert count_wrong_outcomes(plain) is None
 
 
@@ -118,11 +118,11 @@ def test_claims_say_how_a_detector_fails() -> None:
 
 def test_rules_and_hardening_say_it_too() -> None:
     under = {**EXPLAIN["rules"][0], "outcomes": {"missed": 90, "loose": 4}}
-    texts = " ".join(part for section in shown(ExplainResult.of({**EXPLAIN, "rules": [under]})).sections
+    texts = " ".join(part for section in get_view(ExplainResult.of({**EXPLAIN, "rules": [under]})).sections
                      for part in section.text)  # fmt: skip
     assert "of 97 (90 missed, 4 loose)" in texts
     after = {**SHARE, "outcomes": {"loose": 2}}
-    said = shown(HardenResult.of({**HARDEN, "task": "detection", "clean_after": after})).said
+    said = get_view(HardenResult.of({**HARDEN, "task": "detection", "clean_after": after})).statement
     assert "Now, the other plain pictures are 2 in a loose box." in said
 
 

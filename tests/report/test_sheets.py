@@ -17,7 +17,7 @@ import advsearch
 from advsearch.api.export import make_printable_pieces
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError
-from advsearch.report.sheets import MARGIN, PAPERS, Piece, pages_of, write_sheets
+from advsearch.report.sheets import MARGIN, PAPERS, Piece, arrange_pages, write_sheets
 from advsearch.runs.files import read_png, to_8bit
 
 POINT = 25.4 / 72.0
@@ -76,7 +76,7 @@ def test_what_is_larger_than_a_page_is_put_together_again(tmp_path: Path) -> Non
     picture = noise(330, 410)
     piece = Piece("wall", picture, (1.0, 1.0), (3, 3))
     pages = write_sheets(tmp_path / "a.pdf", [piece], "title")
-    tiles = [part for page in pages_of([piece], PAPERS["a4"]) for part in page]
+    tiles = [part for page in arrange_pages([piece], PAPERS["a4"]) for part in page]
     drawn = [image for page in pypdf.PdfReader(tmp_path / "a.pdf").pages[1:] for image in images(page)]
     assert len(drawn) == len(tiles) > 2
     assert pages > 2
@@ -120,11 +120,11 @@ def test_what_cannot_be_printed_is_refused(tmp_path: Path, piece: Piece, paper: 
 def test_more_sheets_than_usual_are_written_when_they_are_asked_for(tmp_path: Path) -> None:
     large = Piece("p", noise(2, 3), (100.0, 150.0))
     with pytest.raises(InputError, match=r"sheets: it takes 6 sheets of a4, and up to 5 are written"):
-        write_sheets(tmp_path / "a.pdf", [large], "t", most=5)
+        write_sheets(tmp_path / "a.pdf", [large], "t", max_sheets=5)
     assert not (tmp_path / "a.pdf").exists()
     with pytest.raises(InputError, match="sheets: expected a whole number from 1 to 10000, got 0"):
-        write_sheets(tmp_path / "a.pdf", [large], "t", most=0)
-    assert write_sheets(tmp_path / "a.pdf", [large], "t", most=6) == 7
+        write_sheets(tmp_path / "a.pdf", [large], "t", max_sheets=0)
+    assert write_sheets(tmp_path / "a.pdf", [large], "t", max_sheets=6) == 7
     assert len(pypdf.PdfReader(tmp_path / "a.pdf").pages) == 7
 
 

@@ -18,9 +18,9 @@ from advsearch.cli.main import main
 from advsearch.errors import StorageError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.export import FORMATS, as_columns, write_rows
+from advsearch.runs.export import FORMATS, list_columns, write_rows
 from advsearch.runs.exporters import EXPORTERS
-from advsearch.runs.listing import finished, listed_runs
+from advsearch.runs.listing import is_finished, list_runs
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer.pages import write_result
 from samples import attack, rated
@@ -39,7 +39,7 @@ ROWS = (
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     with RunDirectory.create("one", config=AttackConfig(object="mug", controls="pose")) as made:
-        made.record(*ROWS)
+        made.append_rows(*ROWS)
         return made.path
 
 
@@ -51,7 +51,7 @@ def table(run: Path, format: str, kind: str | None = None) -> bytes:
 
 
 def test_units_stand_in_the_columns_and_vectors_are_spread() -> None:
-    names = as_columns(ROWS)
+    names = list_columns(ROWS)
     assert names[:3] == ["id", "kind", "step"] and names[-4:] == ["renders", "machine", "seconds", "time"]
     assert names[names.index("payload") + 1 : -4] == [
         "pose.yaw [degrees]",
@@ -150,9 +150,9 @@ def test_an_unknown_kind_leaves_no_file(run: Path) -> None:
 
 
 def test_runs_says_how_each_ended(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert [(one.name, one.state, one.rows) for one in listed_runs(run.parent)] == [("one", "stopped", 3)]
+    assert [(one.name, one.state, one.rows) for one in list_runs(run.parent)] == [("one", "stopped", 3)]
     with RunDirectory.resume("one"):
-        assert listed_runs(run.parent)[0].state == "running"
+        assert list_runs(run.parent)[0].state == "running"
     with RunDirectory.create("two", config=AttackConfig(object="bowl", controls="texture")) as other:
         other.write_summary(attack(verified=rated(19)))
     with RunDirectory.create("three") as third:
@@ -161,7 +161,7 @@ def test_runs_says_how_each_ended(run: Path, capsys: pytest.CaptureFixture[str])
     found = {one["name"]: one for one in json.loads(capsys.readouterr().out)["runs"]}
     assert (found["two"]["state"], found["two"]["answer"], found["two"]["object"]) == ("found", "19/20", "bowl")
     assert found["three"]["state"] == "stopped"
-    assert [finished(run.parent / name) for name in ("one", "two", "three")] == [False, True, False]
+    assert [is_finished(run.parent / name) for name in ("one", "two", "three")] == [False, True, False]
     assert main(["runs"]) == 0
     assert "one" in capsys.readouterr().out
 
@@ -188,10 +188,10 @@ def test_a_run_whose_disk_was_full_at_the_end_goes_on_and_has_everything(
         patched.setattr("advsearch.trust.writing.os.replace", full)
         with RunDirectory.resume("one") as again, pytest.raises(StorageError, match="the disk is full"):
             write_result(again, result)
-    assert not finished(run) and not (run / full_at).exists() and not list(run.glob(".part-*"))
+    assert not is_finished(run) and not (run / full_at).exists() and not list(run.glob(".part-*"))
     with RunDirectory.resume("one") as again:
         write_result(again, result)
-    assert finished(run) and (run / "report.html").is_file()
+    assert is_finished(run) and (run / "report.html").is_file()
 
 
 def test_resume_makes_the_page_again_that_is_missing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,9 +20,9 @@ from advsearch.options import Value
 from advsearch.runs import summary
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.files import read_png
-from advsearch.runs.listing import listed_run
+from advsearch.runs.listing import read_listed_run
 from advsearch.runs.results import Result
-from advsearch.runs.store import Row, Store, Told
+from advsearch.runs.store import CachedEvaluation, Row, Store
 from advsearch.settings import HEADER
 from advsearch.trust.writing import write_text
 from advsearch.viewer import thumbnails
@@ -43,7 +43,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     with Store(folder / "results.sqlite") as store:
         values: dict[str, Value] = {"pose.yaw": {"value": 3.0, "unit": "degrees"}}
         store.append([Row("search", step, objective=0.5, values=values) for step in range(2)])
-        store.set_note("answer", "[0.5]")
+        store.write_note("answer", "[0.5]")
     return folder
 
 
@@ -212,7 +212,7 @@ def test_pipes_in_a_run_do_not_block(name: str, run: Path) -> None:
     os.mkfifo(run / name)
     assert main(["runs"]) == 0 and main(["show", "it"]) in (0, 2) and main(["export", "it"]) in (0, 2)
     with suppress(AdvsearchError), RunDirectory.resume("it") as opened:
-        opened.store.count()
+        opened.store.count_rows()
 
 
 KEPT = (
@@ -262,14 +262,14 @@ def test_a_link_in_a_run_is_followed_by_nobody(
     ]:
         assert main(command) == 2, command
         assert "got a link; remove it" in capsys.readouterr().err.splitlines()[-1], command
-    assert "got a link; remove it" in listed_run(run).fault
+    assert "got a link; remove it" in read_listed_run(run).fault
     assert not (tmp_path / "site").exists() and not list(outside.iterdir())
 
 
 def test_a_run_may_be_reached_by_a_link(run: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").symlink_to(run)
     assert find_run(tmp_path / "elsewhere") == tmp_path / "elsewhere"
-    assert listed_run(tmp_path / "elsewhere").fault == ""
+    assert read_listed_run(tmp_path / "elsewhere").fault == ""
     assert main(["show", str(tmp_path / "elsewhere")]) == 0
 
 
@@ -355,7 +355,7 @@ def test_what_is_inside_a_row_is_checked(column: str, value: object, run: Path) 
 def test_a_summary_has_no_numbers_that_are_none(text: str, run: Path) -> None:
     (run / "summary.json").write_text(json.dumps(SUMMARY | {"epsilon": "HERE"}).replace('"HERE"', text))
     assert main(["show", "it"]) == 2
-    assert text in listed_run(run).fault
+    assert text in read_listed_run(run).fault
 
 
 def test_a_bad_run_does_not_take_the_list_along(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -381,13 +381,13 @@ def test_a_run_is_listed_anew_only_where_it_has_changed(run: Path, monkeypatch: 
         return real(path)
 
     monkeypatch.setattr(summary, "read_result", counted)
-    first = listed_run(run)
-    assert listed_run(run) is first and len(read) == 1
+    first = read_listed_run(run)
+    assert read_listed_run(run) is first and len(read) == 1
     write_text(run / "summary.json", json.dumps(SUMMARY | {"ending": "found"}))
-    assert listed_run(run).state == "found" and len(read) == 2
+    assert read_listed_run(run).state == "found" and len(read) == 2
     with Store(run / "results.sqlite") as store:
         store.append([Row("search", 2)])
-    assert (listed_run(run).rows, listed_run(run).fault) == (3, "")
+    assert (read_listed_run(run).rows, read_listed_run(run).fault) == (3, "")
 
 
 @pytest.mark.parametrize("name", ["results.sqlite", ".lock", "images", "artifacts"])
@@ -418,8 +418,8 @@ def test_a_run_that_links_elsewhere_changes_nothing_there(name: str, run: Path, 
 def test_what_a_search_was_told_is_checked(change: str, tmp_path: Path) -> None:
     path = tmp_path / "results.sqlite"
     with Store(path) as store:
-        store.append([Row("search", 0)], Told(0, b"u", 0, 1))
+        store.append([Row("search", 0)], CachedEvaluation(0, b"u", 0, 1))
     with closing(sqlite3.connect(path)) as db, db:
         db.execute(f"UPDATE told SET {change}")
     with Store(path) as store, pytest.raises(FileFormatError, match="expected what a search was told, got"):
-        store.told("search", 0)
+        store.read_cached("search", 0)

@@ -10,10 +10,10 @@ from typing import ClassVar
 
 from pydantic import Field, computed_field
 
-from advsearch.cli.output import shown_text as check_text
+from advsearch.cli.output import format_result as check_text
 from advsearch.questions.attack.page import make_page as attack_page
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.report.views import facts_of, fields_shown
+from advsearch.report.views import collect_facts, make_default_view
 from advsearch.runs.results import Fields, Interval, JsonFloat, Result, as_fact
 from samples import attack
 
@@ -72,4 +72,4 @@ def test_a_fact_is_shown_of_a_question_without_words_too() -> None:
         command: ClassVar[str] = "counted"
         done: int = Field(description="how many", json_schema_extra=as_fact("{} of 9"))
 
-    assert facts_of(Counted(done=3), fields_shown(Counted(done=3))) == {"done": "3 of 9"}
+    assert collect_facts(Counted(done=3), make_default_view(Counted(done=3))) == {"done": "3 of 9"}

@@ -13,7 +13,7 @@ import pytest
 from advsearch.errors import FileFormatError
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
-from advsearch.runs.tables import NOTE, Units, units_of
+from advsearch.runs.tables import UNITS_NOTE, Units, read_units
 
 
 @pytest.mark.parametrize("frames", [0, 1, 2])
@@ -25,17 +25,19 @@ def test_rows_of_a_unit_differ_in_frame_model_and_prediction_alone(frames: int, 
     digits = product(range(1 + again), range(scenes), *map(range, sizes), range(samples), range(models))
     for step, (_, scene, *places, sample, _) in enumerate(digits):
         places[frames] = 0
-        found.setdefault(whole.of(step), set()).add((scene, *places, sample))
+        found.setdefault(whole.find_unit(step), set()).add((scene, *places, sample))
     assert all(len(one) == 1 for one in found.values()), "a unit has one place beside its frames"
     assert len(found) == scenes * 24 // sizes[frames] * samples == len({min(one) for one in found.values()})
     steps = np.arange(scenes * 24 * samples * models * (1 + again))
-    assert (whole.of(steps) == [whole.of(int(one)) for one in steps]).all()
-    assert (np.unique(whole.of(steps), return_counts=True)[1] == whole.size).all() and whole.name == "drive"
+    assert (whole.find_unit(steps) == [whole.find_unit(int(one)) for one in steps]).all()
+    assert (np.unique(whole.find_unit(steps), return_counts=True)[1] == whole.size).all() and whole.name == "drive"
 
 
 def test_without_frames_a_unit_is_a_picture() -> None:
-    assert Units((3, 2), None, 5).of(np.arange(30)).tolist() == list(range(30)) and Units((1,), 0).name == "picture"
-    assert Units((3,), None, 1, models=2).of(np.arange(6)).tolist() == [0, 0, 1, 1, 2, 2]
+    assert (
+        Units((3, 2), None, 5).find_unit(np.arange(30)).tolist() == list(range(30)) and Units((1,), 0).name == "picture"
+    )
+    assert Units((3,), None, 1, models=2).find_unit(np.arange(6)).tolist() == [0, 0, 1, 1, 2, 2]
 
 
 @pytest.mark.parametrize("frames", [None, 1])
@@ -43,26 +45,26 @@ def test_pictures_that_differ_in_noise_alone_are_one_unit(frames: int | None) ->
     units = Units((3, 5), frames, models=2, noise=4)
     count = 3 if frames == 1 else 15
     steps = np.arange(2 * 15 * 4)
-    assert (np.unique(units.of(steps), return_counts=True)[1] == units.size).all()
-    assert len(np.unique(units.of(steps))) == count
+    assert (np.unique(units.find_unit(steps), return_counts=True)[1] == units.size).all()
+    assert len(np.unique(units.find_unit(steps))) == count
     assert units.name == ("configuration" if frames is None else "drive")
 
 
 def test_older_notes_do_not_say_that_samples_are_noise_and_the_sampler_does(tmp_path: Path) -> None:
     with Store(tmp_path / STORE) as store:
-        store.set_note(NOTE, '{"sizes": [3, 5], "frames": 1, "samples": 4, "models": 2, "again": 0}')
-        assert units_of(store) == Units((3, 5), 1, 4, 2)
-        assert units_of(store, is_drawn=False) == Units((3, 5), 1, 1, 2, noise=4)
+        store.write_note(UNITS_NOTE, '{"sizes": [3, 5], "frames": 1, "samples": 4, "models": 2, "again": 0}')
+        assert read_units(store) == Units((3, 5), 1, 4, 2)
+        assert read_units(store, is_sampled=False) == Units((3, 5), 1, 1, 2, noise=4)
 
 
 def test_a_run_notes_its_units_and_what_is_none_is_refused(tmp_path: Path) -> None:
     with Store(tmp_path / STORE) as store:
-        assert units_of(store) is None
-        store.set_note(NOTE, json.dumps(asdict(Units((3, 5), 1, 2, 2, 60))))
-        assert units_of(store) == Units((3, 5), 1, 2, 2, 60)
+        assert read_units(store) is None
+        store.write_note(UNITS_NOTE, json.dumps(asdict(Units((3, 5), 1, 2, 2, 60))))
+        assert read_units(store) == Units((3, 5), 1, 2, 2, 60)
         huge = {"sizes": [10**30]}, {"sizes": [1 << 40] * 4}, {"again": 10**30}, {"sizes": [1] * 5000}
         none = ("[]", '{"sizes": 3}', '{"sizes": [3], "models": 0}', '{"sizes": ["a"]}')
         for text in (*none, *map(json.dumps, huge), json.dumps({"sizes": [9], "samples": 1 << 61})):
-            store.set_note(NOTE, text)
+            store.write_note(UNITS_NOTE, text)
             with pytest.raises(FileFormatError, match="what units of sampling are"):
-                units_of(store)
+                read_units(store)

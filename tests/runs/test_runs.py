@@ -31,15 +31,15 @@ from advsearch.errors import FileFormatError, InputError, RunExistsError, Storag
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs import directory, files, summary
-from advsearch.runs.directory import RunDirectory, default_name, find_run, run_path
+from advsearch.runs.directory import RunDirectory, find_run, locate_run, make_default_name
 from advsearch.runs.export import FORMATS, write_rows
 from advsearch.runs.files import VERSION
-from advsearch.runs.listing import finished, listed_runs
-from advsearch.runs.results import Result, plain
+from advsearch.runs.listing import is_finished, list_runs
+from advsearch.runs.results import Result, to_json_value
 from advsearch.runs.store import Row, Store
 from advsearch.runs.summary import read_result
 from advsearch.trust.stored_files import open_regular
-from advsearch.trust.writing import PART, RunLock, replacing, write_bytes, write_text
+from advsearch.trust.writing import PART, RunLock, replace_file, write_bytes, write_text
 from samples import attack, exr, rated, sweep
 
 WRITER = """
@@ -94,7 +94,7 @@ def test_a_row_comes_back_as_it_was(run: RunDirectory) -> None:
         kind="search", step=3, seed=2**32 - 1, spp=16, objective=-1.25, success=True, label="wine glass", label_index=5,
         probability=0.75, values={"camera.azimuth": {"value": 130.0, "unit": "degrees"}}, seconds=0.5,
     )  # fmt: skip
-    run.record(row)
+    run.append_rows(row)
     (found,) = run.store.rows()
     assert found.id == 1 and found.time is not None and found.time > 1.6e9
     assert {name: getattr(found, name) for name in vars(row) if name not in ("id", "time")} == {
@@ -103,34 +103,36 @@ def test_a_row_comes_back_as_it_was(run: RunDirectory) -> None:
 
 
 def test_rows_are_added_all_or_none(run: RunDirectory) -> None:
-    run.record(Row("search", 0))
+    run.append_rows(Row("search", 0))
     nothing: Any = object()
     broken = Row("search", 2, values={"p": nothing})
     with pytest.raises(TypeError, match="expected something that JSON can hold, got object"):
-        run.record(Row("search", 1), broken)
-    run.record(Row("search", 5))
+        run.append_rows(Row("search", 1), broken)
+    run.append_rows(Row("search", 5))
     assert [row.step for row in run.store.rows()] == [0, 5]
 
 
 def test_kinds_are_counted_and_read_apart(run: RunDirectory) -> None:
-    run.record(Row("search", 0, objective=1.0), Row("baseline", 0, objective=5.0), Row("search", 1, objective=math.nan))
-    assert (run.store.count(), run.store.count("search"), run.store.count("sweep")) == (3, 2, 0)
+    run.append_rows(
+        Row("search", 0, objective=1.0), Row("baseline", 0, objective=5.0), Row("search", 1, objective=math.nan)
+    )
+    assert (run.store.count_rows(), run.store.count_rows("search"), run.store.count_rows("sweep")) == (3, 2, 0)
     assert [(row.step, row.objective) for row in run.store.rows("search")] == [(0, 1.0), (1, None)]
     assert [row.objective for row in run.store.rows("baseline")] == [5.0]
 
 
 def test_numbers_of_numpy_are_stored_as_numbers(run: RunDirectory) -> None:
-    run.record(Row("search", np.int64(4), objective=np.float32(0.5), success=np.bool_(True), seed=np.uint32(7)))  # type: ignore[arg-type]
+    run.append_rows(Row("search", np.int64(4), objective=np.float32(0.5), success=np.bool_(True), seed=np.uint32(7)))  # type: ignore[arg-type]
     (found,) = run.store.rows()
     assert (found.step, found.objective, found.success, found.seed) == (4, 0.5, True, 7)
 
 
 def test_the_store_is_readable_beside_the_writer(run: RunDirectory) -> None:
-    run.record(Row("search", 0))
+    run.append_rows(Row("search", 0))
     with Store(run.path / "results.sqlite", read_only=True) as reader:
-        assert reader.count() == 1
-        run.record(Row("search", 1))
-        assert reader.count() == 2
+        assert reader.count_rows() == 1
+        run.append_rows(Row("search", 1))
+        assert reader.count_rows() == 2
         with pytest.raises(StorageError, match=r"results\.sqlite: the file system is read-only; choose another place"):
             reader.append([Row("search", 2)])
 
@@ -148,11 +150,11 @@ def test_the_file_is_versioned_commented_and_in_wal_mode(run: RunDirectory) -> N
 
 def test_a_closed_run_is_one_file_and_opens_again(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
-        run.record(Row("search", 0))
+        run.append_rows(Row("search", 0))
     assert not list((tmp_path / "run").glob("results.sqlite-*"))
     with Store(tmp_path / "run" / "results.sqlite") as store:
         store.append([Row("search", 1)])
-        assert store.count() == 2
+        assert store.count_rows() == 2
 
 
 def test_a_step_is_there_once_however_often_it_is_written(tmp_path: Path) -> None:
@@ -164,10 +166,12 @@ def test_a_step_is_there_once_however_often_it_is_written(tmp_path: Path) -> Non
             (2, 1, None),
             (5, 4, "first"),
         ]
-        assert store.count() == 4
-        assert list(store.missing("sweep", 8)) == [range(2, 4), range(5, 8)]
-        assert list(store.missing("sweep", 6)) == [range(2, 4), range(5, 6)]
-        assert list(store.missing("sweep", 5)) == [range(2, 4)] and list(store.missing("none", 2)) == [range(2)]
+        assert store.count_rows() == 4
+        assert list(store.find_missing_steps("sweep", 8)) == [range(2, 4), range(5, 8)]
+        assert list(store.find_missing_steps("sweep", 6)) == [range(2, 4), range(5, 6)]
+        assert list(store.find_missing_steps("sweep", 5)) == [range(2, 4)] and list(
+            store.find_missing_steps("none", 2)
+        ) == [range(2)]
 
 
 def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> None:
@@ -208,7 +212,7 @@ def codec(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 @given(values=st.dictionaries(st.text(), VALUE, max_size=3), objective=st.floats(), label=st.none() | st.text())
 def test_any_values_come_back(codec: Store, values: dict[str, Any], objective: float, label: str | None) -> None:
     label = None if label is None else label.encode("utf-8", "replace").decode()
-    codec.append([Row("search", codec.count(), objective=objective, label=label, values=values)])
+    codec.append([Row("search", codec.count_rows(), objective=objective, label=label, values=values)])
     found = list(codec.rows())[-1]
     assert found.values == values and found.label == label
     assert found.objective == (objective if math.isfinite(objective) else None)
@@ -227,10 +231,10 @@ def test_a_second_process_is_refused(run: RunDirectory) -> None:
 
 
 def test_a_run_in_work_is_not_overwritten(run: RunDirectory) -> None:
-    run.record(Row("search", 0))
+    run.append_rows(Row("search", 0))
     with pytest.raises(InputError, match="is working on this run"):
         RunDirectory.create(run.path, overwrite=True)
-    assert run.store.count() == 1
+    assert run.store.count_rows() == 1
 
 
 def test_a_file_system_without_locks_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,7 +250,7 @@ def test_runs_are_numbered(home: Path) -> None:
     paths = []
     for _ in range(2):
         with RunDirectory.create(default="mug-texture") as run:
-            run.record(Row("search", 0))
+            run.append_rows(Row("search", 0))
             paths.append(run.path)
     assert paths == [Path("runs/mug-texture-001"), Path("runs/mug-texture-002")]
     Path("runs/mug-texture-0999").mkdir()
@@ -270,17 +274,17 @@ def test_no_two_runs_get_one_number(home: Path) -> None:
 
 
 def test_names_and_paths() -> None:
-    assert run_path("first") == Path("runs/first")
-    assert run_path("./first") == Path("./first")
-    assert run_path(Path("first")) == Path("first")
-    assert default_name("../data/My Mug.obj", ["texture", "pose"]) == "my-mug-texture-pose"
-    assert default_name("..", []) == "attack"
+    assert locate_run("first") == Path("runs/first")
+    assert locate_run("./first") == Path("./first")
+    assert locate_run(Path("first")) == Path("first")
+    assert make_default_name("../data/My Mug.obj", ["texture", "pose"]) == "my-mug-texture-pose"
+    assert make_default_name("..", []) == "attack"
 
 
 def test_an_existing_run_is_refused_and_overwritten_on_request(tmp_path: Path) -> None:
     path = tmp_path / "run"
     with RunDirectory.create(path) as run:
-        run.record(Row("search", 0))
+        run.append_rows(Row("search", 0))
         run.save_image("clean", np.zeros((4, 4, 3)))
         run.write_summary(attack())
     (path / "notes.txt").write_text("mine")
@@ -289,7 +293,7 @@ def test_an_existing_run_is_refused_and_overwritten_on_request(tmp_path: Path) -
     ):
         RunDirectory.create(path)
     with RunDirectory.create(path, overwrite=True) as run:
-        assert run.store.count() == 0
+        assert run.store.count_rows() == 0
         assert sorted(found.name for found in path.iterdir()) == [
             ".lock", "notes.txt", "results.sqlite", "results.sqlite-shm", "results.sqlite-wal",
         ]  # fmt: skip
@@ -323,7 +327,7 @@ def test_a_run_that_fails_before_any_result_leaves_nothing(home: Path) -> None:
 @pytest.mark.parametrize("keep", ["row", "summary"])
 def test_a_run_that_fails_later_keeps_what_it_has(tmp_path: Path, keep: str) -> None:
     with pytest.raises(KeyboardInterrupt), RunDirectory.create(tmp_path / "run") as run:
-        run.record(Row("search", 0)) if keep == "row" else run.write_summary(attack(ending="interrupted"))
+        run.append_rows(Row("search", 0)) if keep == "row" else run.write_summary(attack(ending="interrupted"))
         raise KeyboardInterrupt
     assert (tmp_path / "run" / "results.sqlite").exists()
     with RunDirectory.create(tmp_path / "run", overwrite=True):
@@ -331,10 +335,10 @@ def test_a_run_that_fails_later_keeps_what_it_has(tmp_path: Path, keep: str) -> 
 
 
 GONE_ON: dict[str, Callable[[RunDirectory], object]] = {
-    "record": lambda run: run.record(Row("search", 1)),
+    "record": lambda run: run.append_rows(Row("search", 1)),
     "write_summary": lambda run: run.write_summary(attack()),
-    "forget": lambda run: run.store.forget(),
-    "set_note": lambda run: run.store.set_note("a", "b"),
+    "forget": lambda run: run.store.delete_cached(),
+    "set_note": lambda run: run.store.write_note("a", "b"),
     "save_image": lambda run: run.save_image("clean", np.zeros((2, 2, 3))),
     "write_bytes": lambda run: write_bytes(run.path / "images" / "figure.svg", b"<svg/>"),
     "create": lambda run: RunDirectory.create(run.path / "parts" / "00"),
@@ -350,7 +354,7 @@ def test_a_run_whose_folder_went_ends_with_a_sentence_and_leaves_nothing(tmp_pat
     path, other = tmp_path / "run", tmp_path / "moved"
     with pytest.raises(StorageError, match=r"removed or renamed while the run went on.*advsearch resume"):
         with RunDirectory.create(path) as run:
-            run.record(Row("search", 0))
+            run.append_rows(Row("search", 0))
             shutil.rmtree(path) if how == "removed" else path.rename(other)
             if how == "another":
                 shutil.copytree(other, path)
@@ -360,7 +364,7 @@ def test_a_run_whose_folder_went_ends_with_a_sentence_and_leaves_nothing(tmp_pat
     assert ({one.name for one in path.iterdir()} >= kept) if how == "another" else not path.exists()
     if how != "removed":
         with RunDirectory.resume(other) as found:
-            assert found.store.count() == 1
+            assert found.store.count_rows() == 1
 
 
 def test_a_run_that_fails_as_its_folder_goes_tells_its_own_error(tmp_path: Path) -> None:
@@ -374,7 +378,7 @@ def test_a_run_that_fails_as_its_folder_goes_tells_its_own_error(tmp_path: Path)
 
 def test_runs_are_found_by_name_and_path(home: Path) -> None:
     with RunDirectory.create_for(AttackConfig(object="mug")) as run:
-        run.record(Row("search", 0))
+        run.append_rows(Row("search", 0))
     for name in ("mug-texture-001", "runs/mug-texture-001", "runs/mug-texture-001/run.yaml"):
         assert find_run(name) == Path("runs/mug-texture-001")
     with pytest.raises(UnknownNameError, match=r"unknown run 'mug-textur'\. Did you mean 'mug-texture-001'\?"):
@@ -429,7 +433,9 @@ def test_files_of_one_in_several_are_repeated_elsewhere(home: Path) -> None:
     )
     Path("car.csv").write_text("one")
     there = SweepConfig(object="mug", path="approach+car.csv").make_repeatable().path
-    assert there == f"approach+{home / 'car.csv'}" and str(home / "car.csv") in summary.made_with({"path": there})
+    assert there == f"approach+{home / 'car.csv'}" and str(home / "car.csv") in summary.collect_versions(
+        {"path": there}
+    )
     assert all(
         SweepConfig(object="mug", path=one).get_deciding_settings()["path"] == "approach+car.csv"
         for one in (there, "approach+car.csv")
@@ -439,10 +445,10 @@ def test_files_of_one_in_several_are_repeated_elsewhere(home: Path) -> None:
 def test_a_recipe_that_a_run_has_kept_may_be_another_one(home: Path) -> None:
     recipe = Path("own.yaml")
     recipe.write_text("one")
-    noted = summary.made_with({"recipe": "own.yaml"})
+    noted = summary.collect_versions({"recipe": "own.yaml"})
     recipe.write_text("another")
-    assert summary.changed_file(noted, {"recipe": "own.yaml"}) is None
-    assert summary.changed_file(noted, {"camera": "own.yaml"}) == "own.yaml"
+    assert summary.find_changed_file(noted, {"recipe": "own.yaml"}) is None
+    assert summary.find_changed_file(noted, {"camera": "own.yaml"}) == "own.yaml"
 
 
 # ---- whole or not at all ----
@@ -457,7 +463,7 @@ def _raises(number: int) -> Any:
 
 def test_a_file_is_replaced_only_when_all_went_well(tmp_path: Path) -> None:
     path = write_text(tmp_path / "deep" / "summary.json", "old")
-    with pytest.raises(ValueError, match="half way"), replacing(path) as part:
+    with pytest.raises(ValueError, match="half way"), replace_file(path) as part:
         part.write_text("ne")
         raise ValueError("half way")
     assert path.read_text() == "old"
@@ -514,10 +520,10 @@ def test_a_run_that_cannot_start_leaves_nothing(home: Path, monkeypatch: pytest.
 
 
 def test_a_full_disk_stops_the_store_and_keeps_the_rows_before(run: RunDirectory) -> None:
-    run.record(Row("search", 0))
+    run.append_rows(Row("search", 0))
     run.store._db.execute("PRAGMA max_page_count = 8")
     with pytest.raises(StorageError, match=r"cannot write .*results\.sqlite: the disk is full; free some space"):
-        run.record(*(Row("search", step, label="x" * 1000) for step in range(1, 100)))
+        run.append_rows(*(Row("search", step, label="x" * 1000) for step in range(1, 100)))
     assert [row.step for row in run.store.rows()] == [0]
 
 
@@ -560,11 +566,11 @@ def test_halves_go_to_even_and_nan_to_black() -> None:
 def test_png_round_trip_and_equal_bytes(tmp_path: Path) -> None:
     image = np.random.default_rng(0).random((5, 7, 3), dtype=np.float32)
     path = files.write_png(tmp_path / "image.png", image)
-    assert path.read_bytes() == files.png_bytes(image.copy())
+    assert path.read_bytes() == files.encode_png(image.copy())
     np.testing.assert_array_equal(files.to_8bit(files.read_png(path)), files.to_8bit(image))
     assert files.read_png(files.write_png(tmp_path / "grey.png", image[..., :1])).shape == (5, 7, 3)
     with pytest.raises(ValueError, match=r"expected a picture of shape \(H, W, 3\) or \(H, W\), got \(5, 7, 4\)"):
-        files.png_bytes(np.zeros((5, 7, 4)))
+        files.encode_png(np.zeros((5, 7, 4)))
 
 
 def test_exr_round_trip_is_exact_and_equal_bytes(tmp_path: Path) -> None:
@@ -589,7 +595,7 @@ def test_the_difference_is_grey_where_nothing_changed() -> None:
     before = np.full((2, 2, 3), 0.5)
     after = before.copy()
     after[0, 0] = 0.54
-    found = files.difference(before, after)
+    found = files.amplify_difference(before, after)
     np.testing.assert_allclose(found[0, 0], 0.5 + files.DIFFERENCE_GAIN * 0.04, rtol=1e-5)
     assert (found[1] == 0.5).all()
 
@@ -610,13 +616,13 @@ def test_an_animation_is_small_and_holds_its_last_frame(run: RunDirectory) -> No
 def test_noise_still_fits(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
     noise = np.random.default_rng(0).random((24, 96, 96, 3))
     monkeypatch.setattr(files, "ANIMATION_BYTES", limit)
-    assert limit / 4 < len(files.animation_bytes(list(noise))) <= limit
+    assert limit / 4 < len(files.encode_animation(list(noise))) <= limit
 
 
 def test_large_and_single_frames_become_animations() -> None:
-    large = iio.imread(files.animation_bytes([np.zeros((700, 900, 3))] * 2), extension=".gif")
+    large = iio.imread(files.encode_animation([np.zeros((700, 900, 3))] * 2), extension=".gif")
     assert large.shape[1:] == (233, 300, 3)
-    assert iio.imread(files.animation_bytes([np.ones((9, 9, 3))]), extension=".gif").min() == 255
+    assert iio.imread(files.encode_animation([np.ones((9, 9, 3))]), extension=".gif").min() == 255
 
 
 def test_an_array_that_needs_its_gradient_detached() -> None:
@@ -648,10 +654,10 @@ def test_the_summary_is_plain_json(run: RunDirectory) -> None:
 
 def test_numbers_of_any_kind_become_json() -> None:
     values = {"a": np.float64(0.5), "b": np.array(2), "c": Colour.RED, "d": Path("x"), "e": np.float32("nan")}
-    assert plain(values) == {"a": 0.5, "b": 2, "c": "red", "d": "x", "e": None}
-    assert plain({"x": (1, Row("search", 0).kind)}) == {"x": [1, "search"]}
+    assert to_json_value(values) == {"a": 0.5, "b": 2, "c": "red", "d": "x", "e": None}
+    assert to_json_value({"x": (1, Row("search", 0).kind)}) == {"x": [1, "search"]}
     with pytest.raises(TypeError, match="expected something that JSON can hold, got set"):
-        plain({"x": {1}})
+        to_json_value({"x": {1}})
 
 
 def test_a_summary_that_is_not_there_or_damaged_is_said(tmp_path: Path) -> None:
@@ -665,7 +671,7 @@ def test_a_summary_that_is_not_there_or_damaged_is_said(tmp_path: Path) -> None:
 
 def test_all_that_a_run_writes_is_known_to_overwrite(home: Path) -> None:
     with RunDirectory.create_for(AttackConfig(object="mug", run="all")) as run:
-        run.record(Row("search", 0))
+        run.append_rows(Row("search", 0))
         run.save_image("clean", np.zeros((4, 4, 3)))
         run.save_exr("texture", np.zeros((4, 4, 3)), folder="artifacts")
         run.write_summary(attack())
@@ -706,7 +712,7 @@ def filled(run: RunDirectory) -> Store:
         "camera.target": {"value": [0.5, -1.0], "unit": "sizes"},
         "backdrop.which": {"value": 'a,"b"\n', "unit": ""},
     }
-    run.record(
+    run.append_rows(
         Row("search", 0, seed=2**63 - 1, spp=8, objective=0.1 + 0.2, success=True, label="bowl", label_index=2,
             probability=0.5, values=yaw, seconds=0.25, renders=1),
         Row("search", 1, objective=math.nan, success=False, label="mug", values={**yaw, **target}, renders=13,
@@ -785,8 +791,8 @@ def test_without_pyarrow_parquet_says_what_to_do_and_leaves_nothing(
 def test_parquet_takes_more_rows_than_one_group(
     run: RunDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("advsearch.runs.export.GROUP", 4)
-    run.record(*(Row("sweep", step, values={"p": {"value": step / 3, "unit": ""}}) for step in range(11)))
+    monkeypatch.setattr("advsearch.runs.export.ROWS_PER_GROUP", 4)
+    run.append_rows(*(Row("sweep", step, values={"p": {"value": step / 3, "unit": ""}}) for step in range(11)))
     write_rows(run.store, "parquet", tmp_path / "rows.parquet", io.BytesIO())
     file = pyarrow.parquet.ParquetFile(tmp_path / "rows.parquet")
     assert file.num_row_groups == 3
@@ -799,7 +805,7 @@ def test_parquet_takes_more_rows_than_one_group(
 def test_runs_are_listed_with_their_state(home: Path) -> None:
     def make(name: str, summary: Result | None, rows: int = 2) -> None:
         with RunDirectory.create_for(AttackConfig(object="mug", controls=["pose"], run=name)) as run:
-            run.record(*(Row("search", step) for step in range(rows)))
+            run.append_rows(*(Row("search", step) for step in range(rows)))
             if summary is not None:
                 run.write_summary(summary)
 
@@ -811,8 +817,8 @@ def test_runs_are_listed_with_their_state(home: Path) -> None:
     Path("runs/e-damaged/results.sqlite").write_bytes(Path("runs/a-killed/results.sqlite").read_bytes()[:100])
     Path("runs/not-a-run").mkdir()
     with RunDirectory.resume("c-ctrl-c"):
-        during = {one.name: one.state for one in listed_runs(Path("runs"))}
-    found = listed_runs(Path("runs"))
+        during = {one.name: one.state for one in list_runs(Path("runs"))}
+    found = list_runs(Path("runs"))
     assert [one.name for one in found] == ["a-killed", "b-found", "c-ctrl-c", "d-sweep", "e-damaged"]
     assert [one.state for one in found] == ["stopped", "found", "stopped", "finished", "stopped"]
     assert during["c-ctrl-c"] == "running" and during["b-found"] == "found"
@@ -820,5 +826,5 @@ def test_runs_are_listed_with_their_state(home: Path) -> None:
     assert [one.answer for one in found] == ["", "19/20", "vase, unverified", "right in 7 of 8", ""]
     assert found[1].controls == ("pose", "light") and found[0].controls == ("pose",)
     assert (found[0].object, found[0].command, found[4].object) == ("mug", "attack", "?")
-    assert [finished(Path(one.path)) for one in found] == [False, True, False, True, False]
-    assert listed_runs(Path("nowhere")) == []
+    assert [is_finished(Path(one.path)) for one in found] == [False, True, False, True, False]
+    assert list_runs(Path("nowhere")) == []

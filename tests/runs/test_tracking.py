@@ -61,9 +61,9 @@ ROWS = (
 
 def run_of(path: Path, log: str) -> None:
     """An attack that keeps three rows."""
-    with RunDirectory.of(AttackConfig(object="mug", run=str(path), log=log)) as run:
+    with RunDirectory.open(AttackConfig(object="mug", run=str(path), log=log)) as run:
         for row in ROWS:
-            run.record(row)
+            run.append_rows(row)
 
 
 def test_tensorboard_is_told(tmp_path: Path, told: Told) -> None:
@@ -104,9 +104,9 @@ def test_wandb_is_told(tmp_path: Path, told: Told) -> None:
 
 def test_a_batch_of_a_sweep_is_told_by_its_means_and_the_accuracy_so_far(tmp_path: Path, told: Told) -> None:
     config = SweepConfig(object="mug", run=str(tmp_path / "run"), grid={"pose.yaw": [0, 90]}, log="wandb")
-    with RunDirectory.of(config) as run:
-        run.record(Row("sweep", 0, correct=True, margin=-3.0), Row("sweep", 1, correct=False, margin=1.0))
-        run.record(Row("sweep", 2, correct=True), Row("sweep", 3, correct=True))
+    with RunDirectory.open(config) as run:
+        run.append_rows(Row("sweep", 0, correct=True, margin=-3.0), Row("sweep", 1, correct=False, margin=1.0))
+        run.append_rows(Row("sweep", 2, correct=True), Row("sweep", 3, correct=True))
     assert told[1:3] == [
         ("log", {"sweep/margin": -1.0, "sweep/correct": 0.5, "sweep/accuracy": 0.5, "sweep/step": 1}),
         ("log", {"sweep/correct": 1.0, "sweep/accuracy": 0.75, "sweep/step": 3}),
@@ -125,7 +125,7 @@ def test_a_tracker_that_fails_does_not_stop_a_run(
         run_of(tmp_path / "run", "mlflow")
     assert caplog.messages == ["mlflow is told nothing more: no network"]
     with RunDirectory.resume(tmp_path / "run") as run:
-        assert run.store.count() == 3
+        assert run.store.count_rows() == 3
 
 
 def test_a_tracker_that_hangs_does_not_hold_a_run_up(
@@ -133,7 +133,7 @@ def test_a_tracker_that_hangs_does_not_hold_a_run_up(
 ) -> None:
     ended = threading.Event()
     monkeypatch.setattr(sys.modules["mlflow"], "log_metrics", lambda *args, **kwargs: ended.wait(30))
-    monkeypatch.setattr(trackers, "PATIENCE", 0.05)
+    monkeypatch.setattr(trackers, "MAX_CLOSE_SECONDS", 0.05)
     run_of(tmp_path / "run", "mlflow")
     assert ("end_run",) not in told
     ended.set()
@@ -184,6 +184,6 @@ def test_what_is_told_decides_no_numbers(tmp_path: Path, told: Told) -> None:
     """A run goes on with another tracker, or without one."""
     run_of(tmp_path / "run", "mlflow")
     config = AttackConfig(object="mug", run=str(tmp_path / "run"))
-    with RunDirectory.of(config, tmp_path / "run") as run:
-        run.record(Row("search", 2))
+    with RunDirectory.open(config, tmp_path / "run") as run:
+        run.append_rows(Row("search", 2))
     assert told[-1] == ("end_run",)

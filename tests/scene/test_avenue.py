@@ -37,7 +37,7 @@ def test_an_avenue_comes_and_goes_with_its_ground() -> None:
     assert laid(scene.with_settings({"ground.kind": "road"}).description) == {"road"}
     assert not laid(scene.with_settings({"ground.size": 0.0}).description)
     assert not is_enclosed(load_description("car", "street"))
-    assert is_enclosed(load_description("mug", "noon", given={"ground.kind": "avenue"}))
+    assert is_enclosed(load_description("mug", "noon", setting_values={"ground.kind": "avenue"}))
 
 
 @pytest.mark.medium
@@ -130,9 +130,11 @@ def test_lamps_shine_at_dusk_with_the_light_that_they_are_said_to_have() -> None
 
 
 def test_an_absolute_exposure_shows_night_as_night() -> None:
-    day, night = (load_description("car", name, given={"camera.ev": 14.0}) for name in ("avenue", "avenue-night"))
+    day, night = (
+        load_description("car", name, setting_values={"camera.ev": 14.0}) for name in ("avenue", "avenue-night")
+    )
     assert day.environment is not None
     assert day.gain == pytest.approx(day.environment.candelas / (1.2 * 2.0**14))  # type: ignore[operator]
     assert night.gain < 1e-3 * day.gain
     with pytest.raises(InputError, match=r"camera.ev: the brightness of this environment has no unit"):
-        _ = load_description("car", "street", given={"camera.ev": 14.0}).gain
+        _ = load_description("car", "street", setting_values={"camera.ev": 14.0}).gain

@@ -100,7 +100,7 @@ def test_a_vehicle_is_seen_from_the_heights_of_road_users() -> None:
 
 def test_a_height_and_an_elevation_contradict_each_other() -> None:
     with pytest.raises(InputError, match=r"camera.elevation and camera.height say the same thing"):
-        load_description("car", given={"camera.elevation": 10.0, "camera.height": 1.3})
+        load_description("car", setting_values={"camera.elevation": 10.0, "camera.height": 1.3})
     with pytest.raises(InputError, match="elevation and height say the same thing"):
         CameraControl(elevation=[0.0, 5.0], height=[1.0, 2.0]).prepare(load_description("car"))
     with pytest.raises(InputError, match=r"`camera=dashcam` is 1.3 m high, and how large mug is is not known"):
@@ -108,7 +108,7 @@ def test_a_height_and_an_elevation_contradict_each_other() -> None:
 
 
 def test_a_height_is_searched_at_any_distance() -> None:
-    scene = load_description("car", "street", given={"camera.azimuth": 0.0})
+    scene = load_description("car", "street", setting_values={"camera.azimuth": 0.0})
     bound = CameraControl(height=[0.8, 2.0], distance=[6.0, 60.0]).bind(scene)
     for u, height in ((torch.tensor([0.0, 0.0]), 0.8), (torch.tensor([1.0, 1.0]), 2.0)):
         assert lens(scene, bound.inputs(u)["camera.to_world"])[2] == pytest.approx(height, abs=1e-3)

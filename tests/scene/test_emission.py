@@ -82,7 +82,9 @@ def written(folder: Path, made: Any, strength: float = 1.0, **entries: Any) -> P
 
 
 def radiance(file: Path | str, spp: int = 64) -> torch.Tensor:
-    return MitsubaScene(load_description(str(file), "none", given=SEEN), (SIZE, SIZE)).render_radiance({}, 0, spp)
+    return MitsubaScene(load_description(str(file), "none", setting_values=SEEN), (SIZE, SIZE)).render_radiance(
+        {}, 0, spp
+    )
 
 
 def test_a_surface_is_as_bright_as_its_file_says(tmp_path: Path) -> None:
@@ -93,7 +95,7 @@ def test_a_surface_is_as_bright_as_its_file_says(tmp_path: Path) -> None:
 
 
 def test_a_texture_is_where_it_belongs(tmp_path: Path) -> None:
-    scene = load_description(str(written(tmp_path, card(picture=stripes()), 3.0)), "none", given=SEEN)
+    scene = load_description(str(written(tmp_path, card(picture=stripes()), 3.0)), "none", setting_values=SEEN)
     assert scene.notes == ()
     picture = MitsubaScene(scene, (SIZE, SIZE), max_depth=1).render_radiance({}, 0, 16)
     left, right, top, bottom = (SIZE // 2 + away for away in (-4, 4, -4, 4))
@@ -146,7 +148,7 @@ def test_light_arrives_as_by_paths_that_find_it_by_chance(way: str, tmp_path: Pa
     """Next-event estimation of a texture counts on coordinates that no two faces share."""
     picture, uv = WAYS[way]
     seen = {**SEEN, "camera.azimuth": 30.0, "camera.elevation": 20.0}
-    scene = load_description(f"{written(tmp_path, room(picture, uv), 5.0)}#wall", "none", given=seen)
+    scene = load_description(f"{written(tmp_path, room(picture, uv), 5.0)}#wall", "none", setting_values=seen)
     assert scene.meshes["lamp0"].emission is not None
     found, chance = both_ways(scene, "lamp0", OBJECT)
     assert float(found.mean()) > 0.01
@@ -157,7 +159,7 @@ def test_light_arrives_as_by_paths_that_find_it_by_chance(way: str, tmp_path: Pa
 def test_several_parts_are_lit_in_one_map(tmp_path: Path) -> None:
     """The dark parts of an object stay dark, and the light of the other one is all there."""
     seen = {**SEEN, "camera.azimuth": 30.0, "camera.elevation": 20.0}
-    scene = load_description(str(written(tmp_path, room(None, parts=2), 5.0)), "none", given=seen)
+    scene = load_description(str(written(tmp_path, room(None, parts=2), 5.0)), "none", setting_values=seen)
     emission = scene.object.emission
     assert emission is not None and emission.shape == scene.object.base_color.shape
     assert set(np.unique(emission.round(3))) == {0.0, 5.0} and emission.mean() < 1.0
@@ -245,7 +247,7 @@ def test_a_part_that_is_cut_out_whole_is_dark_beside_another(cutoff: float, dark
     file = tmp_path / "room.glb"
     lamp = {"emissiveFactor": [1.0, 1.0, 1.0], "alphaMode": "MASK", "alphaCutoff": cutoff}
     file.write_bytes(changed(scene.export(file_type="glb"), shines.index(True), **lamp))
-    described = load_description(str(file), given=SEEN)
+    described = load_description(str(file), setting_values=SEEN)
     assert described.has_emission is not dark
     MitsubaScene(described, (SIZE, SIZE))
 
@@ -253,7 +255,7 @@ def test_a_part_that_is_cut_out_whole_is_dark_beside_another(cutoff: float, dark
 @pytest.mark.medium
 def test_a_moved_surface_lights_from_where_it_is(tmp_path: Path) -> None:
     """Whatever Mitsuba kept of the place where it was."""
-    scene = load_description(f"{written(tmp_path, room(stripes()), 5.0)}#wall", "none", given=SEEN)
+    scene = load_description(f"{written(tmp_path, room(stripes()), 5.0)}#wall", "none", setting_values=SEEN)
     made = MitsubaScene(scene, (SIZE, SIZE), max_depth=2)
     made.render_radiance({}, 0, 64)
     places = made.get_base_value("lamp0.vertices") + torch.tensor([0.3, 0.5, 0.0])
@@ -299,7 +301,7 @@ def test_the_exposure_meter_sees_surroundings_that_emit_light(tmp_path: Path) ->
         scene = trimesh.Scene()
         scene.add_geometry(card(vertices=far, picture=picture), node_name="lamp")
         scene.add_geometry(wall, node_name="wall")
-        described = load_description(f"{written(tmp_path, scene, 50.0)}#wall", "none", given=SEEN)
+        described = load_description(f"{written(tmp_path, scene, 50.0)}#wall", "none", setting_values=SEEN)
         part = described.surrounding_meshes["lamp"]
         assert part.emission is not None
         level = part.emission.mean(axis=(0, 1)) if mean is None else np.full(3, 50.0)
@@ -353,7 +355,7 @@ def test_derivatives_of_poses_are_differences_and_of_textures_adjoints(tmp_path:
 def test_the_adjoint_of_a_texture_is_right_beside_emission(picture: np.ndarray | None, tmp_path: Path) -> None:
     """Central differences of all texels, and of the radiance itself; the wall and the square light each other."""
     seen = {**SEEN, "camera.azimuth": 30.0}
-    scene = load_description(f"{written(tmp_path, room(picture), 5.0)}#wall", "none", given=seen)
+    scene = load_description(f"{written(tmp_path, room(picture), 5.0)}#wall", "none", setting_values=seen)
     made = MitsubaScene(scene, (SIZE, SIZE), max_depth=4)
     ones = torch.ones(SIZE, SIZE, 3)
     for name, step in (("object.base_color", 0.05), ("lamp0.radiance", 0.5)):
@@ -375,7 +377,7 @@ def test_many_dim_surfaces_do_not_take_the_samples_of_the_environment(tmp_path: 
         dot = card(vertices=CORNERS * 0.01 + [0.1 * number, 0, 2.0])
         dot.visual.material = scene.geometry["geometry_0"].visual.material
         scene.add_geometry(dot, node_name=f"dot{number}")
-    described = load_description(f"{written(tmp_path, scene, 0.1)}#wall", "studio", given=SEEN)
+    described = load_description(f"{written(tmp_path, scene, 0.1)}#wall", "studio", setting_values=SEEN)
     weights = compute_sampling_weights(described.meshes.values())
     assert len(weights) == 30 and sum(weights.values()) == pytest.approx(1.0)
 

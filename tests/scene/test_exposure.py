@@ -43,7 +43,9 @@ def grey_ball(environment: EnvironmentAsset | str, **given: float) -> SceneDescr
     """A matt grey ball, whose rendered radiance an incident meter should foretell."""
     ball = library.load_object("ball")
     matt = replace(ball, base_color=np.full((4, 4, 3), 0.5, np.float32), material=Material(1.0, 0.0, 0.0, 0.0))
-    return load_description(matt, environment, given={name.replace("__", "."): value for name, value in given.items()})
+    return load_description(
+        matt, environment, setting_values={name.replace("__", "."): value for name, value in given.items()}
+    )
 
 
 def test_under_uniform_light_the_card_gets_its_level() -> None:
@@ -55,7 +57,7 @@ def test_under_uniform_light_the_card_gets_its_level() -> None:
 @pytest.mark.parametrize(("ev", "stops"), [(14.0, 0.0), (3.0, 0.0), (14.0, -1.5)])
 def test_an_exposure_value_says_which_luminance_is_white(ev: float, stops: float) -> None:
     """As docs/scenes.md has it: linear value = L / (1.2 * 2 ** ev) * 2 ** exposure, with L in cd/m2."""
-    scene = load_description("car", "avenue", given={"camera.ev": ev, "camera.exposure": stops})
+    scene = load_description("car", "avenue", setting_values={"camera.ev": ev, "camera.exposure": stops})
     assert scene.environment is not None and scene.environment.candelas is not None
     white = 1.2 * 2.0**ev / 2.0**stops  # cd/m2
     assert scene.gain * white / scene.environment.candelas == pytest.approx(1.0)

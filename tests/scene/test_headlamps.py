@@ -247,7 +247,7 @@ def test_a_car_whose_file_names_no_lamps_has_two_before_it_and_two_behind(tmp_pa
     quads = [(1, 3, 4, 2), (5, 6, 8, 7), (1, 2, 6, 5), (3, 7, 8, 4), (1, 5, 7, 3), (2, 4, 8, 6)]
     lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {' '.join(map(str, one))}" for one in quads]
     (tmp_path / "car.obj").write_text("\n".join(lines))
-    described = load_description(str(tmp_path / "car.obj"), "avenue-night", given=LOW, up="z", size=4.0)
+    described = load_description(str(tmp_path / "car.obj"), "avenue-night", setting_values=LOW, up="z", size=4.0)
     front, rear = (glasses(described)[f"object-{one}"] for one in ("headlamps", "taillamps"))
     for part, x, z in ((front, 2.0, 0.63), (rear, -2.0, 0.84)):
         places = (part.mesh.vertices @ part.to_world[:3, :3].T + part.to_world[:3, 3]) * described.metres
@@ -282,7 +282,9 @@ def test_what_cannot_shine_is_refused(words: dict[str, Any], error: type[InputEr
 
 def test_an_object_without_metres_has_no_lamps() -> None:
     with pytest.raises(InputError, match="so many metres apart"):
-        load_description(replace(load_object("mug"), metres=None), "avenue-night", given={"camera.lamps": "low"})
+        load_description(
+            replace(load_object("mug"), metres=None), "avenue-night", setting_values={"camera.lamps": "low"}
+        )
 
 
 @pytest.mark.medium

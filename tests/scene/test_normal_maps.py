@@ -144,7 +144,7 @@ LAMPS = [(4.0, 0.0), (0.0, -4.0)]
 @pytest.fixture(scope="module")
 def wanted(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[float, float]]:
     """The same of the real bump."""
-    scene = load_description(str(written(real(), tmp_path_factory.mktemp("real"))), "none", given=SEEN)
+    scene = load_description(str(written(real(), tmp_path_factory.mktemp("real"))), "none", setting_values=SEEN)
     return [sides(scene, x, z) for x, z in LAMPS]
 
 
@@ -153,7 +153,7 @@ def wanted(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[float, float]
 def test_a_bump_is_lit_as_its_geometry_from_two_sides(
     way: str, wanted: list[tuple[float, float]], tmp_path: Path
 ) -> None:
-    scene = load_description(str(written(WAYS[way](), tmp_path)), "none", given=SEEN)
+    scene = load_description(str(written(WAYS[way](), tmp_path)), "none", setting_values=SEEN)
     assert scene.object.normal_map is not None
     found = [sides(scene, x, z) for x, z in LAMPS]
     assert wanted[0][0] > 0.2 and wanted[1][1] < -0.2
@@ -276,7 +276,7 @@ def test_stock_mitsuba_renders_the_normals_that_are_written(tmp_path: Path) -> N
     mi = import_mitsuba()
     theirs = torch.from_numpy(np.array(mi.render(mi.load_file(str(tmp_path / "out" / "scene.xml")), spp=256)))[..., :3]
     ours = renderer.scene.render_radiance({}, 0, 256)
-    flat = load_description(str(file), given=SEEN)
+    flat = load_description(str(file), setting_values=SEEN)
     flat = replace(flat, object=replace(flat.object, normal_map=None))
     without = MitsubaScene(flat, (SIZE, SIZE)).render_radiance({}, 0, 256)
     assert (theirs - ours).abs().mean() < 0.03 * ours.mean() < (without - ours).abs().mean() * 3.0

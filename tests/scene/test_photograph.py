@@ -64,7 +64,7 @@ def test_a_floor_as_bright_as_the_light_is_white() -> None:
 @pytest.mark.parametrize("rotation", [0.0, 70.0])
 def test_from_where_it_was_taken_the_floor_is_the_photograph(rotation: float) -> None:
     given = {**AWAY, "environment.rotation": rotation}
-    scene = load_description("ball", room(), size=1.0, given={**given, "ground.height": 2.0})
+    scene = load_description("ball", room(), size=1.0, setting_values={**given, "ground.height": 2.0})
     with_floor, without = scene, replace(scene, values={**scene.values, "ground.size": 0.0})
     assert scene.photograph is not None and without.photograph is None
     camera = {"camera.to_world": from_the_tripod(2.0)}
@@ -77,7 +77,9 @@ def test_from_where_it_was_taken_the_floor_is_the_photograph(rotation: float) ->
 
 
 def test_the_object_keeps_light_from_the_floor() -> None:
-    scene = load_description("ball", room(), size=1.0, given={"camera.elevation": 60.0, "camera.distance": 4.0})
+    scene = load_description(
+        "ball", room(), size=1.0, setting_values={"camera.elevation": 60.0, "camera.distance": 4.0}
+    )
     away = replace(scene, values={**scene.values, **AWAY})
     mitsuba = MitsubaScene(scene, (SIZE, SIZE))
     seen = mitsuba.find_surfaces({}).visible_mask("object")
@@ -125,10 +127,10 @@ def test_derivatives_reach_the_floor(controls: dict[str, dict[str, object]]) -> 
 
 def test_photographed_environments_show_their_floor_unless_a_table_is_asked_for() -> None:
     assert load_description("mug").photograph is None
-    assert load_description("mug", given={"ground.kind": "photograph"}).photograph is not None
+    assert load_description("mug", setting_values={"ground.kind": "photograph"}).photograph is not None
     assert load_description("mug", room()).photograph is not None
     for given in ({"ground.kind": "table"}, {"ground.size": 2.0}, {"ground.red": 0.2}, {"ground.size": 0.0}):
-        assert load_description("mug", room(), given=given).photograph is None, given
+        assert load_description("mug", room(), setting_values=given).photograph is None, given
     assert replace(load_description("mug", room()), backdrop=True).photograph is None
     assert load_scene("mug", room()).with_settings({"ground.kind": "table"}).description.photograph is None
 
@@ -141,11 +143,11 @@ def test_the_kind_of_ground_is_told_by_its_name() -> None:
 
 def test_what_contradicts_it_is_explained() -> None:
     with pytest.raises(InputError, match=r"ground\.kind=photograph: the scene has no environment map to show"):
-        load_description("mug", "none", given={"ground.kind": "photograph"})
+        load_description("mug", "none", setting_values={"ground.kind": "photograph"})
     with pytest.raises(InputError, match=r"ground\.kind=photograph and `set` ground\.red contradict each other"):
-        load_description("mug", room(), given={"ground.kind": "photograph", "ground.red": 0.5})
+        load_description("mug", room(), setting_values={"ground.kind": "photograph", "ground.red": 0.5})
     with pytest.raises(UnknownNameError, match=r"unknown ground.kind 'tabel'. Did you mean 'table'"):
-        load_description("mug", given={"ground.kind": "tabel"})
+        load_description("mug", setting_values={"ground.kind": "tabel"})
 
 
 def test_a_sweep_refuses_a_photograph_where_there_is_none() -> None:

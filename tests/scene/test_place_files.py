@@ -18,7 +18,7 @@ import yaml
 from advsearch.cli.main import main
 from advsearch.engine.loading import load_scene
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.runs.summary import file_digests
+from advsearch.runs.summary import compute_file_digests
 from advsearch.scene.assets import Material, Mesh, Shape
 from advsearch.scene.description import load_description
 from advsearch.scene.geometry import compute_base_vertices
@@ -117,8 +117,8 @@ def test_a_street_of_ones_own_stands_around_the_object_to_scale(street: Path) ->
     assert scene.surrounding_meshes["road"].material.specular == pytest.approx(0.25)
     assert scene.environment is not None and scene.environment.name == "my-street"
     assert scene.notes == (), scene.notes
-    assert not is_paved(load_description("car", street, given={"ground.kind": "table"}))
-    assert not load_description("car", street, given={"ground.size": 0.0}).surrounding_meshes
+    assert not is_paved(load_description("car", street, setting_values={"ground.kind": "table"}))
+    assert not load_description("car", street, setting_values={"ground.size": 0.0}).surrounding_meshes
     assert not has_lanes(load_description("car", write(street, lane_width=None)))
 
 
@@ -143,7 +143,7 @@ def test_notes_say_what_stands_in_a_solid_and_where_a_place_ends(street: Path) -
     inside = load_description("car", street, things="car@0,7; person@4,-4")
     assert sum("stands in a house" in note for note in inside.notes) == 1
     assert sum("stands in a post" in note for note in inside.notes) == 1
-    near, far = (load_description("car", street, given={"camera.distance": away}) for away in (10.0, 90.0))
+    near, far = (load_description("car", street, setting_values={"camera.distance": away}) for away in (10.0, 90.0))
     assert list_view_remarks(near, [make_camera_view(near)]) == ()
     (said,) = list_view_remarks(far, [make_camera_view(far)])
     assert "x -30 to 30 m" in said and "the camera is outside" in said
@@ -158,7 +158,7 @@ def test_a_command_renders_in_it_and_its_files_belong_to_the_run(
     command = "render --object car --environment my-street/place.yaml#night --out street.png --resolution 24 --spp 2"
     assert main([*command.split(), "--quiet"]) == 0
     assert (tmp_path / "street.png").is_file()
-    digests = file_digests({"environment": "my-street/place.yaml#night"})
+    digests = compute_file_digests({"environment": "my-street/place.yaml#night"})
     assert {Path(path).name for path in digests} == {"place.yaml", "street.glb", "sky.exr"}
 
 
@@ -277,7 +277,9 @@ def test_a_bundled_place_opens_as_one_of_ones_own(name: str) -> None:
 
 def test_a_road_before_a_picture_holds_as_far_as_the_bundled_street_does() -> None:
     given = {"camera.distance": 30.0, "camera.azimuth": 90.0}
-    own, street = (load_description("car", name, given=given) for name in (BUNDLED / "road" / "place.yaml", "street"))
+    own, street = (
+        load_description("car", name, setting_values=given) for name in (BUNDLED / "road" / "place.yaml", "street")
+    )
     assert find_surroundings(own) == find_surroundings(street)
     assert "the place around the object is a picture" in list_view_remarks(own, [make_camera_view(own)])[0]
 

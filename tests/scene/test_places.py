@@ -33,7 +33,7 @@ def test_a_place_comes_with_its_environment_and_its_faces_look_outwards(place: s
         and is_paved(scene)
         and is_enclosed(scene)
     )
-    assert not load_description(PLACES[place], place, given={"ground.size": 0.0}).surrounding_meshes
+    assert not load_description(PLACES[place], place, setting_values={"ground.size": 0.0}).surrounding_meshes
     for name, part in scene.surrounding_meshes.items():
         corners = part.mesh.vertices.astype(np.float64)[part.mesh.faces]
         faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -32,10 +32,10 @@ def test_a_street_brings_its_road_and_a_table_takes_its_place() -> None:
     assert not is_paved(load_scene("car", "noon").description)
     for given in ({"ground.kind": "table"}, {"ground.size": 2.0}, {"ground.size": 0.0}, {"ground.red": 0.5}):
         assert not is_paved(street.with_settings(given).description), given
-        assert not is_paved(load_description("car", "street", given=given)), given
+        assert not is_paved(load_description("car", "street", setting_values=given)), given
     assert is_paved(load_scene("mug", "noon", settings={"ground.kind": "road"}).description)
     with pytest.raises(InputError, match=r"ground.kind=wet-road and `set` ground.red contradict each other"):
-        load_description("car", "street", given={"ground.kind": "wet-road", "ground.red": 0.5})
+        load_description("car", "street", setting_values={"ground.kind": "wet-road", "ground.red": 0.5})
 
 
 @pytest.mark.medium
@@ -68,7 +68,7 @@ def test_the_road_is_seen_and_hidden() -> None:
 
 @pytest.mark.parametrize(("name", "metres"), [("car", 4.3), ("chair", 0.92)])
 def test_distances_are_in_metres_where_the_object_has_a_size(name: str, metres: float) -> None:
-    scene = load_description(name, given={"camera.distance": 10.0})
+    scene = load_description(name, setting_values={"camera.distance": 10.0})
     middle = (scene.object.mesh.vertices.min(axis=0) + scene.object.mesh.vertices.max(axis=0)) / 2.0
     away = float(np.linalg.norm(camera_to_world(scene)[:3, 3] - middle))
     assert away == pytest.approx(10.0 / metres, rel=0.01)
@@ -97,7 +97,7 @@ def test_an_object_of_several_materials_keeps_its_finishes() -> None:
     values = {round(float(one), 3) for one in np.unique(rough)}
     assert values == {round(one.roughness, 3) for one in car.object.finishes.values()}
     with pytest.raises(InputError, match=r"material.roughness: the object has several materials"):
-        load_description("car", given={"material.roughness": 0.1})
+        load_description("car", setting_values={"material.roughness": 0.1})
 
 
 def test_only_the_paint_is_painted() -> None:

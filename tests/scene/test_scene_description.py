@@ -25,7 +25,7 @@ def projected(description: SceneDescription) -> np.ndarray:
 @pytest.mark.parametrize("name", ["mug", "bowl", "lamp", "wine-glass"])
 @pytest.mark.parametrize("fov", [20.0, 35.0, 60.0])
 def test_the_default_camera_frames_the_whole_object_and_fills_the_frame(name: str, fov: float) -> None:
-    points = projected(load_description(name, given={"camera.fov": fov}))
+    points = projected(load_description(name, setting_values={"camera.fov": fov}))
     assert points[:, 2].min() > 0.0
     assert np.abs(points[:, :2]).max() == pytest.approx(FRAME_FILL, abs=1e-3)
 
@@ -34,7 +34,7 @@ def test_the_default_camera_frames_the_whole_object_and_fills_the_frame(name: st
 @pytest.mark.parametrize("name", ["mug", "banana", "hammer", "chair", "teapot"])
 def test_no_azimuth_takes_any_of_the_object_out_of_the_picture(name: str) -> None:
     reached = [
-        np.abs(projected(load_description(name, given={"camera.azimuth": float(azimuth)}))[:, :2]).max()
+        np.abs(projected(load_description(name, setting_values={"camera.azimuth": float(azimuth)}))[:, :2]).max()
         for azimuth in range(0, 360, 5)
     ]
     assert max(reached) <= 1.0 + 1e-6
@@ -50,33 +50,35 @@ def test_the_distance_does_not_depend_on_where_the_camera_is_moved_to(name: str)
 
 
 def test_a_very_wide_lens_does_not_enter_the_object() -> None:
-    scene = load_description("dumbbell", given={"camera.fov": 170.0})
+    scene = load_description("dumbbell", setting_values={"camera.fov": 170.0})
     radius = np.linalg.norm(scene.object.mesh.vertices - compute_center(scene), axis=1).max()
     assert np.linalg.norm(camera_to_world(scene)[:3, 3] - compute_center(scene)) >= radius + 0.02 - 1e-9
 
 
 def test_a_camera_at_azimuth_zero_and_no_elevation_looks_from_plus_x_with_z_up() -> None:
-    camera = camera_to_world(load_description("mug", given={"camera.azimuth": 0.0, "camera.elevation": 0.0}))
+    camera = camera_to_world(load_description("mug", setting_values={"camera.azimuth": 0.0, "camera.elevation": 0.0}))
     assert np.allclose(camera[:3, 2], [-1, 0, 0]) and np.allclose(camera[:3, 1], [0, 0, 1])
     assert camera[0, 3] > 0 and np.linalg.det(camera[:3, :3]) == pytest.approx(1.0)
 
 
 def test_a_rolled_camera_turns_the_picture_and_nothing_else() -> None:
-    plain, rolled = (camera_to_world(load_description("ball", given={"camera.roll": roll})) for roll in (0.0, 90.0))
+    plain, rolled = (
+        camera_to_world(load_description("ball", setting_values={"camera.roll": roll})) for roll in (0.0, 90.0)
+    )
     assert np.allclose(rolled[:3, 2], plain[:3, 2])
     assert np.allclose(np.abs(rolled[:3, 0] @ plain[:3, 1]), 1.0)
 
 
 @pytest.mark.parametrize("pose", [{}, {"pose.pitch": 35.0}, {"pose.roll": 90.0, "pose.scale": 2.0}])
 def test_an_object_stands_on_the_ground_in_every_pose(pose: dict[str, float]) -> None:
-    description = load_description("mug", given=pose)
+    description = load_description("mug", setting_values=pose)
     matrix = object_to_world(description)
     heights = description.object.mesh.vertices @ matrix[2, :3] + matrix[2, 3]
     assert heights.min() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_height_above_the_ground_is_added() -> None:
-    matrix = object_to_world(load_description("ball", given={"pose.z": 0.25}))
+    matrix = object_to_world(load_description("ball", setting_values={"pose.z": 0.25}))
     assert matrix[2, 3] == pytest.approx(0.25, abs=1e-6)
 
 

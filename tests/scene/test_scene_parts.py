@@ -68,7 +68,7 @@ def test_meshes_have_names_and_one_of_them_is_the_object() -> None:
 @pytest.mark.medium
 def test_a_scene_is_seen_by_any_of_its_cameras() -> None:
     scene = load_description("mug")
-    side = load_description("mug", given={"camera.azimuth": 130.0, "camera.fov": 50.0})
+    side = load_description("mug", setting_values={"camera.azimuth": 130.0, "camera.fov": 50.0})
     cameras = {"front": PosedCamera(camera_to_world(scene), 35.0), "side": PosedCamera(camera_to_world(side), 50.0)}
     scene = replace(scene, cameras=cameras)
     assert torch.equal(picture(Scene(scene.with_camera("front"))), picture(Scene(scene)))

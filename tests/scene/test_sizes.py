@@ -154,7 +154,7 @@ def test_the_floor_of_a_photograph_is_seen_from_a_tripod(tmp_path: Path) -> None
         ({}, {}, 3.0),
         ({}, {"ground.height": 2.0}, 2.0),
     ):
-        assert load_description(path, given=given, up="z", **said).capture_height == pytest.approx(height)  # type: ignore[arg-type]
+        assert load_description(path, setting_values=given, up="z", **said).capture_height == pytest.approx(height)  # type: ignore[arg-type]
 
 
 SIZES = {

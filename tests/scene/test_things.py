@@ -112,7 +112,7 @@ def test_what_stands_in_a_house_or_a_post_of_a_place_is_said(environment: str, t
 @pytest.mark.parametrize("kind", ["avenue", "crossing", "car-park"])
 def test_solids_of_a_place_are_where_its_meshes_are(kind: str) -> None:
     """Each post, trunk and house has some of its mesh's vertices at its outline, and the object stands free."""
-    scene = load_description("car", "overcast", given={"ground.kind": kind})
+    scene = load_description("car", "overcast", setting_values={"ground.kind": kind})
     assert not scene.remarks
     meshes = {"a house": "houses", "the trunk of a tree": "trees", "a lamp post": "posts"}
     meshes["the post of a sign"] = "sign-post"
@@ -128,14 +128,16 @@ def test_solids_of_a_place_are_where_its_meshes_are(kind: str) -> None:
 
 def test_a_room_has_walls_and_shelves_that_nothing_stands_in() -> None:
     for place, solid in (("0,1.95", "a wall"), ("-1.6,0", "a piece of furniture"), ("0.2,0.3", None)):
-        scene = load_description("mug", "kitchen", given={"ground.kind": "room"}, things=f"mug@{place},name=it")
+        scene = load_description(
+            "mug", "kitchen", setting_values={"ground.kind": "room"}, things=f"mug@{place},name=it"
+        )
         assert bool(scene.remarks) == (solid is not None)
         assert solid is None or solid in scene.remarks[0]
 
 
 def test_a_camera_inside_a_house_is_said_and_how_often_it_is_there() -> None:
     def notes(given: dict[str, float], **ranges: list[float]) -> tuple[str, ...]:
-        scene = load_description("car", "avenue", given=given)
+        scene = load_description("car", "avenue", setting_values=given)
         control = make_control("camera", dict(ranges)) if ranges else make_control("pose")
         return make_space([control], scene).list_notes(scene)
 
@@ -156,7 +158,7 @@ def test_a_camera_outside_a_room_is_said(distance: float, elevation: float, soli
         "camera.distance": distance,
         "camera.elevation": elevation,
     }
-    scene = load_description("mug", "kitchen", given=given)
+    scene = load_description("mug", "kitchen", setting_values=given)
     notes = make_space([make_control("pose")], scene).list_notes(scene)
     assert bool(notes) == (solid is not None)
     assert solid is None or f"The camera is inside {solid} of the place" in notes[-1]

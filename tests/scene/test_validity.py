@@ -114,7 +114,7 @@ def test_from_60_m_the_houses_stand_below_the_road() -> None:
 
 def test_along_a_street_it_fits_as_far_as_its_road() -> None:
     scene = load_description(
-        "car", "street", given={"camera.azimuth": 0.0, "camera.elevation": 2.0, "camera.distance": 40.0}
+        "car", "street", setting_values={"camera.azimuth": 0.0, "camera.elevation": 2.0, "camera.distance": 40.0}
     )
     far, high = find_valid_range(find_surroundings(scene), make_camera_view(scene))  # type: ignore[arg-type]
     assert LENGTH / 2.0 < far < LENGTH / 2.0 + 10.0
@@ -126,7 +126,12 @@ def photographed(height: float | None = None, radius: float | None = None, **sai
     given = {"ground.height": height, "ground.radius": radius}
     lit = EnvironmentAsset("hall", np.ones((8, 16, 3), np.float32), photographed=True)
     loose = replace(load_object("mug"), metres=None)
-    return load_description(loose, lit, given={name: one for name, one in given.items() if one is not None}, **said)  # type: ignore[arg-type]
+    return load_description(
+        loose,
+        lit,
+        setting_values={name: one for name, one in given.items() if one is not None},
+        **said,  # type: ignore[arg-type]
+    )
 
 
 def test_a_photograph_fits_by_its_height_and_its_empty_floor() -> None:
@@ -149,10 +154,10 @@ def test_what_has_no_ground_to_fit_has_no_bound() -> None:
     for scene in (
         load_description("mug", "studio"),
         load_description("car", "noon"),
-        load_description("mug", "street", given={"ground.size": 0.0}),
+        load_description("mug", "street", setting_values={"ground.size": 0.0}),
     ):
         assert find_surroundings(scene) is None
-    noon = load_description("car", "noon", given={"ground.kind": "road"})
+    noon = load_description("car", "noon", setting_values={"ground.kind": "road"})
     assert find_valid_range(find_surroundings(noon), make_camera_view(noon))[1] == math.inf  # type: ignore[arg-type]
     assert find_valid_range(Surroundings(1.5, 12.0, math.inf), CameraView(0.0, 180.0, 0.0, 1.0, -3.0)) == (12.0, 3.0)
 
@@ -180,6 +185,6 @@ def test_a_search_that_goes_past_it_says_so(controls: dict[str, dict[str, object
 
 
 def test_a_street_that_is_turned_fits_nowhere() -> None:
-    scene = load_description("car", "street", given={"environment.rotation": 30.0, "camera.elevation": 3.0})
+    scene = load_description("car", "street", setting_values={"environment.rotation": 30.0, "camera.elevation": 3.0})
     assert find_valid_range(find_surroundings(scene), make_camera_view(scene)) == (0.0, 0.0)  # type: ignore[arg-type]
     assert "turns against the road" in list_view_remarks(scene, [make_camera_view(scene)])[0]

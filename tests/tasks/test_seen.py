@@ -25,7 +25,7 @@ from advsearch.engine.record import make_trial_row, read_judgement
 from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results import plain
+from advsearch.runs.results import to_json_value
 from advsearch.runs.store import Row, Store
 from advsearch.tasks import Facts, Judgement, Prediction, Sight, Task
 
@@ -93,11 +93,11 @@ KEPT = {"boxes": [[1, 2.5, 3, 4]], "words": ["a, b", 'c"d', None], "deep": {"er"
 def test_a_payload_comes_back_from_the_rows_of_searches_and_trials(tmp_path: Path, payload: Any) -> None:
     judgement = Judgement(1.0, 1.0, False, Prediction("here"), payload)
     with RunDirectory.create(tmp_path / "run") as run:
-        run.record(make_trial_row("sweep", 0, 7, 1, judgement), Row("sweep", 1))
+        run.append_rows(make_trial_row("sweep", 0, 7, 1, judgement), Row("sweep", 1))
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
         row, without = store.rows()
-    assert row.payload == plain(payload) and without.payload is None
-    assert read_judgement(row) == Judgement(1.0, 1.0, False, Prediction("here"), plain(payload))
+    assert row.payload == to_json_value(payload) and without.payload is None
+    assert read_judgement(row) == Judgement(1.0, 1.0, False, Prediction("here"), to_json_value(payload))
     with RunDirectory.resume(tmp_path / "run") as run:
         problem: Any = None
         (answer,) = Journal(run, ParallelEvaluator(problem)).evaluate_all(

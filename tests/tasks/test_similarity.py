@@ -20,7 +20,7 @@ from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch.models import Model, ModelWarning
 from advsearch.runs.files import read_png, to_8bit
-from advsearch.runs.summary import file_digests
+from advsearch.runs.summary import compute_file_digests
 from advsearch.tasks import Facts, make_task
 from advsearch.tasks.similarity import ITSELF, SOMETHING_ELSE, TEMPERATURE, Similarity
 from small_models import SIDE
@@ -423,7 +423,7 @@ def test_options_that_make_no_sense_are_refused(model: Model) -> None:
 
 def test_a_folder_of_references_has_one_digest(folder: Path) -> None:
     settings = {"task": {"name": "similarity", "references": str(folder)}, "run": str(folder)}
-    before = file_digests(settings)
+    before = compute_file_digests(settings)
     assert list(before) == [str(folder)]
     write(folder / "red" / "0.png", torch.ones(8, 8, 3))
-    assert file_digests(settings) != before
+    assert compute_file_digests(settings) != before

@@ -71,7 +71,7 @@ def test_a_file_that_gives_no_size_is_limited_too() -> None:
 def test_the_factor_of_limits_is_checked(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ADVSEARCH_LIMITS", value)
     with pytest.raises(InputError, match="ADVSEARCH_LIMITS: expected a number greater than 0"):
-        stored_files.scaled(1)
+        stored_files.scale_limit(1)
 
 
 def test_text_is_utf8(tmp_path: Path) -> None:

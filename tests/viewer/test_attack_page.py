@@ -14,9 +14,9 @@ import pytest
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
 from advsearch.questions.attack import wording
-from advsearch.report.figures import search_axes
-from advsearch.report.views import NARROW, WIDE, Html, element, join_html, study_chart
-from advsearch.report.wording import interval_text, objective_label, percent, seconds_text
+from advsearch.report.figures import draw_searches
+from advsearch.report.views import NARROW_WIDTH, WIDE_WIDTH, Html, join_html, make_chart_svg, make_element
+from advsearch.report.wording import format_interval, format_objective, format_seconds, percent
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.files import read_png
 from advsearch.statistics.intervals import clopper_pearson
@@ -192,7 +192,7 @@ def test_an_objective_has_its_unit(name: str) -> None:
     unit = OBJECTIVE_KINDS[name].unit.partition(" (")[0] if name in OBJECTIVE_KINDS else "none"
     shown = {"margin": "margin loss", "pixel_margin": "margin loss of the pixels"}.get(name, name)
     told = shown if unit in ("none", "that of the task") else f"{shown} [{unit}]"
-    assert objective_label(name) == told
+    assert format_objective(name) == told
 
 
 def test_names_cannot_become_markup(tmp_path: Path) -> None:
@@ -251,17 +251,17 @@ def test_without_a_summary_there_is_no_page(tmp_path: Path) -> None:
 
 
 def test_text_is_escaped_and_markup_is_not() -> None:
-    assert element("p", "<b>", Html("<i></i>"), None, class_='"') == '<p class="&quot;">&lt;b&gt;<i></i></p>'
-    assert element("img", src="&") == '<img src="&amp;">'
-    assert join_html("<", element("br")) == "&lt;<br>"
+    assert make_element("p", "<b>", Html("<i></i>"), None, class_='"') == '<p class="&quot;">&lt;b&gt;<i></i></p>'
+    assert make_element("img", src="&") == '<img src="&amp;">'
+    assert join_html("<", make_element("br")) == "&lt;<br>"
 
 
-def searches(objectives: dict[str, list[float | None]], zero: str = "", width: int = WIDE) -> Html:
-    return study_chart(partial(search_axes, objectives, "margin", zero_means=zero), "the search", width)
+def searches(objectives: dict[str, list[float | None]], zero: str = "", width: int = WIDE_WIDTH) -> Html:
+    return make_chart_svg(partial(draw_searches, objectives, "margin", zero_means=zero), "the search", width)
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("width", [WIDE, NARROW])
+@pytest.mark.parametrize("width", [WIDE_WIDTH, NARROW_WIDTH])
 @pytest.mark.parametrize(
     "values", [[1.0], [2.0, 2.0, 2.0], [None, 1.0, None], [1e-12, 2e-12], [-1e9, 1e9], [float(i) for i in range(5000)]]
 )
@@ -288,7 +288,7 @@ def test_the_numbers_at_an_axis_are_whole() -> None:
 
 @pytest.mark.parametrize("name", ["$x$", "<b>&", "\u6a21"])
 def test_any_name_may_stand_in_a_chart(name: str) -> None:
-    page = Page(study_chart(partial(search_axes, {name: [0.0, 1.0]}, name), name))
+    page = Page(make_chart_svg(partial(draw_searches, {name: [0.0, 1.0]}, name), name))
     assert page.text.count(name) >= 3 and not page.all("b")
 
 
@@ -460,10 +460,10 @@ def test_of_a_path_each_trial_has_another_moment() -> None:
 
 
 def test_the_ends_of_an_interval_have_the_digits_that_fit_and_are_not_clamped() -> None:
-    assert interval_text(clopper_pearson(1, 120)) == "0.02-4.6 %"
-    assert interval_text(clopper_pearson(119, 120)) == "95.4-99.98 %"
-    assert interval_text(clopper_pearson(1, 10_000)) == "0.0003-0.06 %"
-    assert interval_text(clopper_pearson(60, 120)) == "41-59 %"
+    assert format_interval(clopper_pearson(1, 120)) == "0.02-4.6 %"
+    assert format_interval(clopper_pearson(119, 120)) == "95.4-99.98 %"
+    assert format_interval(clopper_pearson(1, 10_000)) == "0.0003-0.06 %"
+    assert format_interval(clopper_pearson(60, 120)) == "41-59 %"
 
 
 @pytest.mark.parametrize(
@@ -490,7 +490,7 @@ def test_only_certainty_is_called_100_percent(share: float | None, text: str) ->
     [(0.26, "0.3 s"), (99.4, "99.4 s"), (185, "3 min 5 s"), (7800, "2 h 10 min"), (None, "unknown")],
 )
 def test_times(seconds: float | None, text: str) -> None:
-    assert seconds_text(seconds) == text
+    assert format_seconds(seconds) == text
 
 
 def test_where_random_search_won_it_is_said() -> None:
@@ -511,7 +511,7 @@ def test_a_damaged_object_is_left_out(tmp_path: Path) -> None:
     for data in (b"", b"glTF", b"glTF" + bytes(40), b"GIF89a" * 9, good[:2000], good + bytes(MAX_OBJECT_BYTES)):
         file.write_bytes(data)
         assert read_object(tmp_path) == b""
-    assert make_object_part(b"").empty
+    assert make_object_part(b"").is_empty
 
 
 METHOD: dict[str, Any] = {

@@ -25,10 +25,10 @@ from advsearch.questions.recipe.result import RecipeResult
 from advsearch.questions.replay.result import ReplayResult
 from advsearch.questions.stability.result import StabilityResult
 from advsearch.questions.sweep.page import write_bundle
-from advsearch.report.wording import percent_number, prediction_text
+from advsearch.report.wording import format_percent_number, format_prediction
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Result
-from advsearch.runs.store import Row, Store, Told
+from advsearch.runs.store import CachedEvaluation, Row, Store
 from advsearch.tasks import Prediction
 from advsearch.viewer import thumbnails
 from advsearch.viewer.document import read_asset
@@ -332,7 +332,7 @@ def test_a_sweep_that_goes_on_is_followed(browser: Browser, tmp_path: Path) -> N
     with serving(run) as server, RunDirectory.resume(run) as held:
         with opened(browser, f"{server.address}runs/going/") as page:
             page.wait_for_selector("[data-cell]")
-            held.record(Row("sweep", 24, correct=False, margin=9.0, label="vase", values=last.values))
+            held.append_rows(Row("sweep", 24, correct=False, margin=9.0, label="vase", values=last.values))
             until(page, lambda: "vase" in page.locator(".gallery").inner_text())
 
 
@@ -340,10 +340,10 @@ def test_an_attack_that_goes_on_is_followed_step_by_step(browser: Browser, tmp_p
     path = tmp_path / "going"
 
     def evaluated(run: RunDirectory, number: int) -> None:
-        told = Told(number, b"", 0, 1, picture=np.full((8, 8, 3), 25 * number, np.uint8))
+        told = CachedEvaluation(number, b"", 0, 1, picture=np.full((8, 8, 3), 25 * number, np.uint8))
         values = {"pose.yaw": described(10.0 * number, "degrees")}
         label = "vase" if number > 5 else "mug"
-        run.record(Row("search", number, objective=float(number), label=label, values=values), told=told)
+        run.append_rows(Row("search", number, objective=float(number), label=label, values=values), cached=told)
 
     with RunDirectory.create_for(AttackConfig(object="mug", run=str(path))) as run, serving(path) as server:
         for number in range(5):
@@ -370,7 +370,7 @@ def test_an_attack_that_goes_on_is_followed_step_by_step(browser: Browser, tmp_p
             page.wait_for_timeout(400)
             assert status.inner_text() == stopped
             (path / "report.html").write_text("<link rel=icon href=data:,><h1>what came out</h1>")
-            run.store.forget()
+            run.store.delete_cached()
             until(page, lambda: page.locator("h1").inner_text() == "what came out")
 
 
@@ -504,7 +504,7 @@ def test_everybody_can_use_the_pages_of_results(browser: Browser, tmp_path: Path
 
 def test_everybody_can_use_the_list_and_what_goes_on(browser: Browser, sweep: Path, tmp_path: Path) -> None:
     with RunDirectory.create_for(AttackConfig(object="mug", run=str(tmp_path / "going"))) as run:
-        run.record(Row("search", 0, objective=1.0, label="mug", values={"pose.yaw": described(1.0, "degrees")}))
+        run.append_rows(Row("search", 0, objective=1.0, label="mug", values={"pose.yaw": described(1.0, "degrees")}))
         with serving(sweep, run.path, make_sweep(tmp_path / "second")) as server:
             for path, there in (("", "button"), ("runs/going/", "svg circle")):
                 with opened(browser, server.address + path, 390, bypass_csp=True, color_scheme="light") as page:
@@ -546,7 +546,7 @@ def test_drawn_parameters_are_shown_in_the_parts_of_the_table(browser: Browser) 
     assert made["labels"] == ["1 to 10", "10 to 100"] and made["level"] == [0, 1, 1, 1, 1]
     numbers = (0.0, 1e-9, 0.0002, 0.0459, 0.5, 0.97, 0.9996, 0.999999999, 1.0)
     assert page.evaluate(f"{code} return {list(numbers)}.map((one) => percentNumber(one)); }})()") == list(
-        map(percent_number, numbers)
+        map(format_percent_number, numbers)
     )
     for task, label, share in (
         ("detection", "no car", 0.15),
@@ -555,7 +555,9 @@ def test_drawn_parameters_are_shown_in_the_parts_of_the_table(browser: Browser) 
         ("classification", "lamp", 0.99999),
     ):
         said = page.evaluate(f"{code} return said({task!r}, {label!r}, {share}); }})()")
-        assert said == prediction_text(task, Prediction(label, None, share)).replace(", ", " ").replace(" %", "\u00a0%")
+        assert said == format_prediction(task, Prediction(label, None, share)).replace(", ", " ").replace(
+            " %", "\u00a0%"
+        )
 
 
 def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from advsearch.options import Value
 from advsearch.runs.store import NAME, Row, Store
-from advsearch.runs.tables import sweep_frame
+from advsearch.runs.tables import make_sweep_frame
 from advsearch.viewer.columns import NO_PROBABILITY, UNKNOWN, pack_columns, read_columns
 from advsearch.viewer.thumbnails import find_thumbnails, thumbnail_path
 from stored_sweeps import make_sweep
@@ -28,7 +28,7 @@ def row(step: int, **values: Any) -> Row:
 
 def unpacked(rows: Iterable[Row]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Head and columns as a reader of the bytes finds them."""
-    data = pack_columns(sweep_frame(rows))
+    data = pack_columns(make_sweep_frame(rows))
     size = int.from_bytes(data[:4], "little")
     head = json.loads(data[4 : 4 + size])
     kinds = {one["name"]: (np.dtype(one["type"]), one["at"]) for one in head["columns"]}

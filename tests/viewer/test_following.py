@@ -11,7 +11,7 @@ import numpy as np
 
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.store import Row, Told
+from advsearch.runs.store import CachedEvaluation, Row
 from advsearch.viewer.server import FIRST_ROW_ID, is_unfinished, make_progress_json, make_progress_page
 from stored_sweeps import described, serving
 
@@ -19,9 +19,11 @@ from stored_sweeps import described, serving
 def step(run: RunDirectory, number: int, *, picture: bool = True) -> None:
     """What a search leaves of one evaluation."""
     shown = np.full((4, 4, 3), 20 * number, np.uint8) if picture else None
-    told = Told(number, b"", 0, 1, gradient=np.zeros(5, np.float32), picture=shown)
+    told = CachedEvaluation(number, b"", 0, 1, gradient=np.zeros(5, np.float32), picture=shown)
     values = {"pose.yaw": described(10.0 * number, "degrees")}
-    run.record(Row("search", number, objective=float(number), success=False, label="mug", values=values), told=told)
+    run.append_rows(
+        Row("search", number, objective=float(number), success=False, label="mug", values=values), cached=told
+    )
 
 
 def news(run: Path, after: int = FIRST_ROW_ID) -> dict[str, Any]:
@@ -45,7 +47,7 @@ def test_what_is_new_is_told_once(tmp_path: Path) -> None:
         again = news(run.path, first["next"])
         assert again["rows"] == again["pictures"] == [] and again["next"] == first["next"]
         step(run, 3)
-        run.record(Row("baseline", 0, objective=float("nan"), values={"pose.yaw": described(float("inf"))}))
+        run.append_rows(Row("baseline", 0, objective=float("nan"), values={"pose.yaw": described(float("inf"))}))
         later = news(run.path, again["next"])
         assert [(row["kind"], row["objective"]) for row in later["rows"]] == [("search", 3.0), ("baseline", None)]
         assert [one["step"] for one in later["pictures"]] == [3]
@@ -65,7 +67,7 @@ def test_its_own_page_is_shown_when_it_has_ended(tmp_path: Path) -> None:
             assert len(json.load(answer)["rows"]) == 1
         (path / "report.html").write_text("what came out")
         assert is_unfinished(path)  # an attack that is resumed has the page of its first sitting
-        run.store.forget()
+        run.store.delete_cached()
         assert not is_unfinished(path) and news(path)["ended"]
         with urlopen(address) as answer:
             assert answer.read().endswith(b"what came out")

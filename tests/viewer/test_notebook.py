@@ -16,8 +16,8 @@ from PIL import Image
 
 from advsearch.questions.attack.summary import CurveResult
 from advsearch.questions.sweep.display import draw_sweep_on
-from advsearch.report.figures import search_axes
-from advsearch.report.views import side_by_side
+from advsearch.report.figures import draw_searches
+from advsearch.report.views import join_images
 from conftest import ROOT
 from samples import CURVE, sweep
 
@@ -69,7 +69,7 @@ def test_the_notebook_about_losses_is_its_page() -> None:
 
 def test_a_search_is_drawn_with_its_best() -> None:
     axes = Figure().subplots()
-    search_axes({"pgd": [None, -2.0, 1.0, 0.5], "random": [-3.0]}, "margin", axes)
+    draw_searches({"pgd": [None, -2.0, 1.0, 0.5], "random": [-3.0]}, "margin", axes)
     assert axes.get_ylabel() == "margin"
     assert axes.get_legend_handles_labels()[1] == ["pgd", "random"]
     best = np.asarray(axes.get_lines()[1].get_ydata(), dtype=float)
@@ -102,7 +102,7 @@ def test_a_figure_is_a_picture_and_what_has_none_says_so() -> None:
 
 
 def test_pictures_stand_side_by_side() -> None:
-    with Image.open(io.BytesIO(side_by_side([np.zeros((8, 8, 3)), np.full((8, 8, 3), 0.5)]))) as shown:
+    with Image.open(io.BytesIO(join_images([np.zeros((8, 8, 3)), np.full((8, 8, 3), 0.5)]))) as shown:
         values = np.asarray(shown)
     assert values.shape == (8, 20, 3)
     assert (values[:, :8] == 0).all() and (values[:, 8:12] == 255).all() and (values[:, 12:] == 128).all()

@@ -34,7 +34,7 @@ from advsearch.questions.photographs.result import (
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.statistics.intervals import clopper_pearson
-from advsearch.trust.network import https_context
+from advsearch.trust.network import make_https_context
 from advsearch.viewer.clients import MAX_BODY_BYTES, find_reachable_address
 from advsearch.viewer.server import Dashboard
 from samples import make_run
@@ -178,7 +178,7 @@ def test_photographs_are_judged_by_the_runs_model_and_counted(tmp_path: Path, ta
     assert two.files == ["2-0001.jpg", "2-0002.jpg"]
     assert all(find_photo(run, name).read_bytes()[:2] == b"\xff\xd8" for name in (*one.files, *two.files))
     with Store(run / "results.sqlite", read_only=True) as store:
-        row = store.row("photo", 1)
+        row = store.read_row("photo", 1)
     assert row is not None
     assert row.values["camera.elevation"]["value"] == 40.0  # the configuration that it should show
     assert row.label == grey
@@ -331,7 +331,7 @@ def test_the_key_is_for_this_user_alone_and_does_not_stay(tmp_path: Path, monkey
 
     monkeypatch.setattr(ssl.SSLContext, "load_cert_chain", looked_at)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    https_context(["127.0.0.1", "localhost"])
+    make_https_context(["127.0.0.1", "localhost"])
     assert seen == [(0o600, 0o700)]
     assert list(tmp_path.iterdir()) == []
 

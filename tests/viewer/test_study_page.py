@@ -13,7 +13,7 @@ from advsearch.cli.main import main
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.recipe.result import RecipeResult
 from advsearch.questions.stability.result import StabilityResult
-from advsearch.report.views import fields_shown
+from advsearch.report.views import make_default_view
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Result, StudyResult
 from advsearch.viewer.document import make_header
@@ -108,7 +108,7 @@ def test_a_recipe_leads_to_its_runs(tmp_path: Path) -> None:
 
 def test_only_words_that_are_shown_are_explained(tmp_path: Path) -> None:
     result = StabilityResult.of(STABILITY)
-    page = make_view_page(tmp_path, result, fields_shown(result))
+    page = make_view_page(tmp_path, result, make_default_view(result))
     meanings = page[page.index("What these words mean") :]
     assert "every picture and gradient was finite" in meanings
     assert "cases that were not begun" not in meanings

@@ -34,16 +34,20 @@ class Sheets(Exporter):
         profile = None if options["icc"] is None else Path(options["icc"])
         title = f"{Path(run).name}, object of {exports.format_rounded(longest)} mm"
         paper = (options["paper"] or "a4").lower()
-        most = exports.MOST_SHEETS if options["sheets"] is None else options["sheets"]
-        with writing.placed_by("out"), writing.replacing(out) as part:
+        most = (
+            exports.DEFAULT_MAX_SHEETS
+            if options["sheets"] is None
+            else options["sheets"]
+        )
+        with writing.name_setting_in_errors("out"), writing.replace_file(out) as part:
             pages = exports.write_sheets(
                 part,
                 pieces,
                 title,
                 paper=paper,
                 profile=profile,
-                most=most,
-                last=exports.draw_chart_page,
+                max_sheets=most,
+                make_last_page=exports.draw_chart_page,
             )
         sizes = [
             {"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]}

@@ -49,10 +49,10 @@ def write_threedb(
         if name not in numbers:
             numbers[name] = max(numbers.values(), default=-1) + 1
     class_by_number = {number: name for name, number in numbers.items()}
-    with writing.placed_by("out"):
+    with writing.name_setting_in_errors("out"):
         n_rows = 0
         with (
-            writing.replacing(out / DETAILS) as part,
+            writing.replace_file(out / DETAILS) as part,
             part.open("w", encoding="utf-8") as file,
         ):
             for row in rows():

@@ -71,7 +71,7 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
             "answers freely"
         )
     kind = type(loaded.network).__name__
-    with models.foreign(
+    with models.translate_errors(
         f"model {loaded.spec}: is a {kind}, which can't be asked about "
         "a picture as LLaVA can"
     ):

@@ -40,7 +40,7 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
         with (
             models.without_unpickling(),
             warnings.catch_warnings(),
-            models.connecting(models.may_fetch(spec), tries),
+            models.restrict_connections(models.is_fetch_allowed(spec), tries),
         ):
             warnings.simplefilter("ignore")
             yield
@@ -53,10 +53,10 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
             raise models.CodeNotAllowedError(
                 f"a file names the model {spec}, which is not on this machine and "
                 "would be fetched; "
-                f"{models.how_to_allow(spec)}"
+                f"{models.explain_how_to_allow(spec)}"
             ) from error
         raise errors.ModelError(
-            f"model {spec}: cannot be fetched or read ({models.first_line(error)}). "
+            f"model {spec}: cannot be fetched or read ({models.get_first_line(error)}). "
             "Weights come from the library's "
             "cache on this machine, else from where it publishes them; they are never "
             f"unpickled. {advice}"
@@ -240,7 +240,7 @@ def _make_called_processing(
             spec,
             processor,
             f"{what}, and lets no gradient through "
-            f"({models.first_line(error)}){advice}",
+            f"({models.get_first_line(error)}){advice}",
         ) from error
     error_size = np.inf
     if output.shape == (1, *expected.shape):

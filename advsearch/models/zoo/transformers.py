@@ -223,9 +223,9 @@ def _load_config(
         raise errors.ModelError(
             f"model {spec}: {name} is no folder here{_suggest_folders(name)}, and no "
             "repository of that name is in the "
-            f"cache{_format_suggestions(models.resembling(name, cached))} or can be "
+            f"cache{_format_suggestions(models.find_similar_names(name, cached))} or can be "
             "had "
-            f"({models.first_line(error)}). Check the "
+            f"({models.get_first_line(error)}). Check the "
             "name and the network, or give a folder"
         ) from error
 
@@ -252,7 +252,7 @@ def _suggest_folders(name: str) -> str:
     siblings = []
     if path.parent.is_dir():
         siblings = [entry.name for entry in path.parent.iterdir() if entry.is_dir()]
-    similar = models.resembling(path.name, siblings)
+    similar = models.find_similar_names(path.name, siblings)
     return _format_suggestions([str(path.parent / sibling) for sibling in similar])
 
 

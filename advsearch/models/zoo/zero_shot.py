@@ -57,7 +57,7 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
     has_sigmoid = hasattr(loaded.network, "logit_bias")
     texts = [prompts[0].replace("{}", word) for word in words]
     with (
-        models.foreign(f"model {name}: cannot embed the names of `labels`"),
+        models.translate_errors(f"model {name}: cannot embed the names of `labels`"),
         torch.no_grad(),
     ):
         network: Any = models.copy_sharing_weights(loaded.network).eval()
@@ -277,7 +277,9 @@ def make_detector_source(loaded: LoadedNetwork) -> models.Source:
     tokenizer = loaded.load_part("AutoTokenizer")
     words = get_spoken_names(names)
     with (
-        models.foreign(f"model {loaded.name}: cannot read the names of `labels`"),
+        models.translate_errors(
+            f"model {loaded.name}: cannot read the names of `labels`"
+        ),
         torch.no_grad(),
     ):
         network: Any = models.copy_sharing_weights(loaded.network).eval()

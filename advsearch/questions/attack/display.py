@@ -46,25 +46,27 @@ def make_attack_claims(result: AttackResults) -> Iterator[Claim]:
     else:
         yield _attack_claim(result)
         if result.average is not None:
-            yield views.average_claim(result.average, wording.budget_text(result))
+            yield views.make_average_claim(result.average, wording.budget_text(result))
 
 
 def _attack_claim(result: AttackSummary) -> Claim:
     """Return what an attack claims of the scene that it found."""
     rate = result.verified
     verdict = wording.attack_verdict(result)
-    extent = views.extent_of("fresh renders that count as a success", rate)
+    extent = views.make_rate_extent("fresh renders that count as a success", rate)
     if result.ending == "found" and rate is not None and rate.successes:
         text = f"{verdict} How many such configurations there are is not known."
         return views.claim("found", text, extent)
-    if result.ending in views.ENDED and rate is not None:
-        searches = views.searches_text(
+    if result.ending in views.FAILED_SEARCH_ENDINGS and rate is not None:
+        searches = views.format_searches(
             result.renders, result.policy, result.baseline is not None
         )
         text = f"{verdict} Searched were {searches}. {views.NO_PROOF}"
         return views.claim("not found", text, extent)
     unknown = f"the search ended as {result.ending!r} without trials that carry a claim"
-    return views.nothing_claimed(views.WHY.get(result.ending, unknown), verdict)
+    return views.make_no_claim(
+        views.REASON_OF_ENDING.get(result.ending, unknown), verdict
+    )
 
 
 def _matrix_claims(result: MatrixResult) -> Iterator[Claim]:
@@ -73,9 +75,9 @@ def _matrix_claims(result: MatrixResult) -> Iterator[Claim]:
         for cell in row.tested:
             searches = None
             if cell.model == row.attacked:
-                searches = views.searches_text(row.renders, result.policy, False)
+                searches = views.format_searches(row.renders, result.policy, False)
             name = f"searched on {row.attacked}, tried on {cell.model}"
-            yield views.case_claim(name, cell.ending, cell.verified, searches)
+            yield views.make_case_claim(name, cell.ending, cell.verified, searches)
 
 
 def _view_attack(summary: AttackSummary) -> ShownResult:
@@ -90,7 +92,7 @@ def _view_attack(summary: AttackSummary) -> ShownResult:
     over = ""
     if summary.over:
         over = f"{' and '.join(summary.over)}, drawn anew for every picture"
-    steps = words.count(summary.steps, "step")
+    steps = words.format_count(summary.steps, "step")
     facts = {
         "wanted": wording.goal_text(summary),
         "changed": wording.changed_text(summary),
@@ -120,10 +122,10 @@ def _rates_part(summary: AttackSummary) -> ResultPart:
     baseline = summary.baseline
     average = summary.average
     success = wording.success_name(summary)
-    prediction = words.prediction_cells(summary.task, clean)
+    prediction = words.format_prediction_cells(summary.task, clean)
     rows = [["clean", *prediction, *_rate_cells("right", clean.control)]]
     if summary.adversarial:
-        prediction = words.prediction_cells(summary.task, summary.adversarial)
+        prediction = words.format_prediction_cells(summary.task, summary.adversarial)
         rate = _rate_cells(success, summary.verified)
         rows.append(["adversarial", *prediction, *rate])
     if baseline:
@@ -131,9 +133,9 @@ def _rates_part(summary: AttackSummary) -> ResultPart:
         rate = _rate_cells(success, baseline.verified)
         rows.append(["random search", images, "", *rate])
     if average:
-        right = words.tally("right", average.correct, average.configurations)
-        configurations = words.count(average.configurations, "configuration")
-        interval = words.interval_text(average.interval)
+        right = words.format_tally("right", average.correct, average.configurations)
+        configurations = words.format_count(average.configurations, "configuration")
+        interval = words.format_interval(average.interval)
         rows.append(["average case", configurations, "", right, interval])
     number_head = "action" if summary.task == words.COMMAND else "probability"
     heads = ("", "prediction", number_head, "rate", "95 % interval")
@@ -147,8 +149,8 @@ def _rate_cells(
     if rate is None:
         return "not verified", ""
     n_counted = rate.correct if isinstance(rate, ControlGroup) else rate.successes
-    text = words.tally(outcome, n_counted, rate.trials, rate.not_a_number)
-    return text, words.interval_text(rate.interval)
+    text = words.format_tally(outcome, n_counted, rate.trials, rate.not_a_number)
+    return text, words.format_interval(rate.interval)
 
 
 def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
@@ -166,19 +168,19 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
     )
     columns: Mapping[str, Column] = {
         "ambient light": "{0.lux:.3g} lux",
-        "wrong": lambda point: words.tally(
+        "wrong": lambda point: words.format_tally(
             wording.success_name(summary),
             point.verified.successes,
             point.verified.trials,
         ),
-        "95 % interval": lambda point: words.interval_text(point.verified.interval),
+        "95 % interval": lambda point: words.format_interval(point.verified.interval),
         "": lambda point: "holds" if point.holds else "ends",
     }
     note = (
         "Exposure follows the ambient light: the projector alone is darker beside it."
     )
     return [
-        ResultPart.table(
+        ResultPart.make_table(
             light.points, columns, title="Ambient light", text=[text], note=note
         )
     ]
@@ -186,7 +188,7 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
 
 def failures_text(failures: DifferentFailures) -> str:
     """Return where different failures were found, and how many hold."""
-    where = f"{failures.found} of {words.count(failures.seen, 'draw')}"
+    where = f"{failures.found} of {words.format_count(failures.seen, 'draw')}"
     if failures.places is not None:
         where = (
             f"{failures.found} of {failures.places} cells over "
@@ -194,7 +196,7 @@ def failures_text(failures: DifferentFailures) -> str:
         )
     if failures.share is not None:
         where += (
-            f"; of all configurations {words.interval_text(failures.share.interval)} "
+            f"; of all configurations {words.format_interval(failures.share.interval)} "
             "fail "
             "in one render (95 % interval)"
         )
@@ -215,19 +217,19 @@ def make_failures_part(known: DifferentFailures, *, tried: bool = False) -> Resu
         "failures": range_text,
         "most often predicted": most_frequent_label,
         "holds in fresh renders": _holds_text,
-        "objective": lambda failure: words.number_text(failure.objective),
+        "objective": lambda failure: words.format_number(failure.objective),
     }
     failures = [
         failure for failure in known.listed if not tried or failure.verified is not None
     ]
-    return ResultPart.table(failures, columns)
+    return ResultPart.make_table(failures, columns)
 
 
 def _holds_text(failure: DifferentFailure) -> str:
     rate = failure.verified
     if rate is None:
         return "not tried"
-    renders = words.count(rate.trials, "render")
+    renders = words.format_count(rate.trials, "render")
     return f"{'yes' if failure.holds else 'no'}, {rate.successes} of {renders}"
 
 
@@ -243,7 +245,7 @@ def range_text(failure: DifferentFailure) -> str:
             continue
         value = failure.configuration.get(name)
         unit = "" if value is None or value.unit in ("", "1") else f" {value.unit}"
-        low, high = map(words.number_text, bounds)
+        low, high = map(words.format_number, bounds)
         texts.append(f"{name} {low} to {high}{unit}")
     return ", ".join(texts) or "anywhere"
 
@@ -280,13 +282,13 @@ def _view_curve(result: CurveResult) -> ShownResult:
         "epsilon": lambda point: epsilon_text(point.epsilon) or "own",
         "robust": "{0.robust}/{0.objects}",
         "accuracy": lambda point: words.percent(point.accuracy),
-        "95 % interval": lambda point: words.interval_text(point.interval),
+        "95 % interval": lambda point: words.format_interval(point.interval),
         "wrong already": "{0.already_wrong}",
     }
-    curve = ResultPart.table(
+    curve = ResultPart.make_table(
         known, point_columns, title="" if has_chart else CURVE_TITLE, note=CURVE_NOTE
     )
-    margin = words.margin_text(result.task)
+    margin = words.get_margin_meaning(result.task)
     meaning = f"Margin: {margin}, in the trials of the worst case."
     sections = [
         *([chart] if points else []),
@@ -318,7 +320,7 @@ def _objects_part(result: CurveResult) -> ResultPart:
     if any(row.average for row in result.table):
         columns["right on average"] = _average_text
         columns["95 % interval"] = _average_interval
-    return ResultPart.table(
+    return ResultPart.make_table(
         result.table,
         columns,
         title="The objects, at the last epsilon tried",
@@ -335,7 +337,7 @@ def _average_text(row: ObjectRow) -> str:
 
 
 def _average_interval(row: ObjectRow) -> str:
-    return words.interval_text(row.average.interval) if row.average else ""
+    return words.format_interval(row.average.interval) if row.average else ""
 
 
 def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
@@ -372,7 +374,7 @@ def epsilon_text(value: EpsilonBudget) -> str:
         return ",".join(
             f"{name}={epsilon_text(epsilon)}" for name, epsilon in value.items()
         )
-    return "" if value is None else words.number_text(value)
+    return "" if value is None else words.format_number(value)
 
 
 def _draw_curve(result: CurveResult, points: Sequence[CurvePoint], axes: Any) -> None:
@@ -400,12 +402,12 @@ def _curve_claims(result: CurveResult) -> Iterator[Claim]:
         renders.update(row.renders or {})
     searches = ""
     if renders:
-        spent = views.searches_text(renders, result.policy, bool(renders["baseline"]))
+        spent = views.format_searches(renders, result.policy, bool(renders["baseline"]))
         searches = f"Searched were, of all objects and epsilons together, {spent}. "
     for point in result.curve:
         if point.accuracy is None:
             continue
-        extent = views.counted(
+        extent = views.make_extent(
             "objects without a failure", point.robust, point.objects, point.interval
         )
         budget = "the controls' own budget"
@@ -413,14 +415,14 @@ def _curve_claims(result: CurveResult) -> Iterator[Claim]:
             budget = f"epsilon {point.epsilon:g}"
         text = (
             f"Within {budget} the policy {result.policy} found no failure of "
-            f"{views.share_text(extent)} objects; "
+            f"{views.format_extent(extent)} objects; "
             f"{point.already_wrong} are wrong as they are. "
             f"{searches}{views.NO_PROOF}"
         )
         yield views.claim("measured", text, extent)
     for row in result.table:
         if row.average is not None:
-            yield views.average_claim(row.average, row.object)
+            yield views.make_average_claim(row.average, row.object)
 
 
 def _view_matrix(result: MatrixResult) -> ShownResult:
@@ -450,22 +452,24 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
     The stronger a cell's color, the more successes.
     """
     heads = ["attacked on", "ending"]
-    heads += [f"tested on {words.short_name(tested.model)}" for tested in result.tested]
+    heads += [
+        f"tested on {words.shorten_name(tested.model)}" for tested in result.tested
+    ]
     rows = list[list[str]]()
     runs = list[str | None]()
     if result.tested:
         clean_rates = [
-            f"right {', '.join(words.rated_cells(tested.clean))}"
+            f"right {', '.join(words.format_rate_cells(tested.clean))}"
             for tested in result.tested
         ]
         rows.append(["clean scene", "", *clean_rates])
         runs.append(None)
     rate_of_cell = dict[tuple[int, int], float]()
     for row in result.table:
-        cells = [words.short_name(row.attacked), row.ending]
+        cells = [words.shorten_name(row.attacked), row.ending]
         for cell in row.tested:
             rate_of_cell[len(rows), len(cells)] = cell.verified.rate
-            rate = ", ".join(words.rated_cells(cell.verified))
+            rate = ", ".join(words.format_rate_cells(cell.verified))
             cells.append(rate + ENDING_MARKS.get(cell.ending, ""))
         rows.append(cells)
         runs.append(row.run)
@@ -522,10 +526,12 @@ def _draw_matrix(result: MatrixResult, axes: Any) -> None:
             text = f"{cell.verified.successes}/{cell.verified.trials}"
             color = "white" if rates[y][x] > 0.6 else "black"
             axes.text(x, y, text, ha="center", va="center", color=color)
-    tested_names = [words.short_name(tested.model) for tested in result.tested]
+    tested_names = [words.shorten_name(tested.model) for tested in result.tested]
     rotation = 20 if max(map(len, tested_names)) > 12 else 0
     axes.set_xticks(range(len(tested_names)), tested_names, rotation=rotation)
-    axes.set_yticks(range(len(rows)), [words.short_name(row.attacked) for row in rows])
+    axes.set_yticks(
+        range(len(rows)), [words.shorten_name(row.attacked) for row in rows]
+    )
     axes.set(xlabel="tested on", ylabel="attacked on")
     axes.set_title(
         f"{', '.join(result.objects)}, {', '.join(result.controls)}: wrong in trials"

@@ -58,7 +58,7 @@ from advsearch.questions.attack.summary import (
     TriedObjective,
     VerificationSamples,
 )
-from advsearch.report.wording import number_text
+from advsearch.report.wording import format_number
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import (
     AverageCase,
@@ -159,7 +159,7 @@ def make_result(
     if run is not None:
         write_result(run, summary)
         if not findings.interrupted:
-            run.store.forget()
+            run.store.delete_cached()
     return AttackResult(
         summary,
         None if run is None else run.path,
@@ -613,7 +613,7 @@ def _to_range(described: Sequence[Value], *, is_choice: bool) -> VariedValue:
     numbers = [float(value) for value in values if isinstance(value, (int, float))]
     if numbers and not is_choice:
         return VariedValue(unit=unit, low=min(numbers), high=max(numbers))
-    names = [number_text(value) for value in dict.fromkeys(values)]
+    names = [format_number(value) for value in dict.fromkeys(values)]
     return VariedValue(unit=unit, names=names)
 
 

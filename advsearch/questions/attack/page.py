@@ -18,9 +18,9 @@ from PIL import Image, ImageSequence
 from advsearch.questions.attack import display, wording
 from advsearch.questions.attack.summary import AttackSummary, FoundValue
 from advsearch.report import wording as words
-from advsearch.report.figures import search_axes
+from advsearch.report.figures import draw_searches
 from advsearch.report.views import Column, Html, Picture, ResultPart
-from advsearch.report.wording import count, number_text
+from advsearch.report.wording import format_count, format_number
 from advsearch.runs import directory, files, store
 from advsearch.runs.results import (
     ControlGroup,
@@ -80,7 +80,7 @@ def make_page(run: Path, result: Result) -> str | None:
     facts = {
         **view.facts,
         "time": _time_text(result.seconds),
-        "image formation": words.formation_text(result.image_formation),
+        "image formation": words.format_formation(result.image_formation),
         "environment": result.environment,
         "seed": str(result.seed),
     }
@@ -113,7 +113,7 @@ def _read_objectives(run: Path) -> dict[str, list[float | None]]:
 
 def _time_text(seconds: Mapping[str, float]) -> str:
     """Return the total time, with that of each stage."""
-    times = {name: words.seconds_text(value) for name, value in seconds.items()}
+    times = {name: words.format_seconds(value) for name, value in seconds.items()}
     total = times.pop("total")
     stages = ", ".join(f"{name} {text}" for name, text in times.items())
     return f"{total} ({stages})" if stages else total
@@ -161,7 +161,7 @@ def _image_parts(
             "What it predicts",
             pictures=[_clean_and_adversarial(summary, MARKED)],
             layout="large",
-            note=words.marks_text(summary.task),
+            note=words.get_marks_legend(summary.task),
         )
     trial_images = _find_trial_images(images)
     if trial_images:
@@ -192,7 +192,7 @@ def _clean_and_adversarial(summary: AttackSummary, suffix: str) -> list[Picture]
     ):
         caption = "no prediction recorded"
         if prediction is not None:
-            caption = words.prediction_text(summary.task, prediction)
+            caption = words.format_prediction(summary.task, prediction)
         pictures.append(Picture(f"images/{name}{suffix}", caption, name.capitalize()))
     return pictures
 
@@ -227,10 +227,10 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
     rows = []
     bars = []
     for name, changed in (summary.configuration or {}).items():
-        clean = "" if changed.clean is None else number_text(changed.clean)
+        clean = "" if changed.clean is None else format_number(changed.clean)
         values = changed.value if isinstance(changed.value, list) else [changed.value]
         unit = "" if changed.unit in ("", "1", "name") else f" {changed.unit}"
-        adversarial = ", ".join(map(number_text, values)) + unit
+        adversarial = ", ".join(map(format_number, values)) + unit
         rows.append([name, clean, adversarial, _range_text(changed)])
         bars.append(_range_bar(changed))
     heads = ("parameter", "clean", "adversarial", "in its range")
@@ -257,7 +257,7 @@ def _range_text(changed: FoundValue) -> str:
     distance_to_end = min(changed.value - low, high - changed.value)
     is_at_end = distance_to_end <= END_TOLERANCE * (high - low)
     at_end = ", at its end" if is_at_end else ""
-    return f"{number_text(low)} to {number_text(high)}{at_end}"
+    return f"{format_number(low)} to {format_number(high)}{at_end}"
 
 
 def _range_bar(changed: FoundValue) -> tuple[float, ...] | None:
@@ -303,7 +303,7 @@ def _failures_parts(summary: AttackSummary) -> Iterator[ResultPart]:
             continue
         name = ""
         if failure.pictured:
-            name = words.prediction_text(summary.task, failure.pictured)
+            name = words.format_prediction(summary.task, failure.pictured)
         name = name or display.most_frequent_label(failure)
         pictures.append(Picture(failure.picture, display.range_text(failure), name))
     yield replace(
@@ -369,11 +369,11 @@ def _search_part(
     if summary.objective in words.SUCCESS_ABOVE_ZERO:
         above = "right" if summary.minimises else wording.success_name(summary)
         zero_means = f"above: {above}"
-    label = words.objective_label(summary.objective)
+    label = words.format_objective(summary.objective)
     return ResultPart(
         "The search",
         [f"{label} over evaluations. {'; '.join(ranges)}"],
-        draw=partial(search_axes, curves, label, zero_means=zero_means),
+        draw=partial(draw_searches, curves, label, zero_means=zero_means),
         note="Lines: the best so far. Dots: each evaluation. These are the search's "
         "claims; the table above is "
         "verified.",
@@ -389,13 +389,15 @@ def _plan_part(plan: PlannedGradient) -> ResultPart:
         "why": "{0.reason}",
         "step": _step_text,
     }
-    spp = "" if plan.spp is None else f", {count(plan.spp, 'sample')} a pixel"
+    spp = "" if plan.spp is None else f", {format_count(plan.spp, 'sample')} a pixel"
     renders = (
-        f"{count(plan.renders_per_gradient, 'render')} a gradient beside the "
+        f"{format_count(plan.renders_per_gradient, 'render')} a gradient beside the "
         "picture itself"
     )
-    title = f"Gradient plan: {count(len(plan.groups), 'parameter')}, {renders}{spp}"
-    return ResultPart.table(plan.groups, columns, title=title, folded=True)
+    title = (
+        f"Gradient plan: {format_count(len(plan.groups), 'parameter')}, {renders}{spp}"
+    )
+    return ResultPart.make_table(plan.groups, columns, title=title, folded=True)
 
 
 def _step_text(group: GroupDerivative) -> str:

@@ -20,7 +20,7 @@ from advsearch.engine.loading import Controls, Scene
 from advsearch.engine.naming import AnyModel, get_model_name, list_models
 from advsearch.errors import InputError
 from advsearch.options import describe_value, to_setting
-from advsearch.progress import Watched, watcher
+from advsearch.progress import ProgressOption, as_progress
 from advsearch.questions.attack.carry_out import (
     AttackParts,
     is_named,
@@ -31,7 +31,7 @@ from advsearch.questions.attack.carry_out import (
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.run import run_attack
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.runs.directory import begun, is_run, run_path
+from advsearch.runs.directory import create_before_work, is_run, locate_run
 from advsearch.settings import PythonOnly
 from advsearch.tasks import AnyTask, FunctionTask, Task, make_task
 
@@ -74,7 +74,7 @@ def attack(
     metrics: Mapping[str, str | Metric] | None = None,
     run: str | Path | None = None,
     resume: bool = False,
-    progress: Watched = None,
+    progress: ProgressOption = None,
     **settings: Unpack[AttackKeywords],
 ) -> AttackResult:
     """Search for the worst configuration of a scene, verify it, and return the result.
@@ -157,7 +157,7 @@ def attack(
             is_stored=run is not None,
             metrics=judging.load_metrics(config.metrics, metrics),
         )
-        return run_attack(parts, watcher(progress), directory)
+        return run_attack(parts, as_progress(progress), directory)
 
 
 def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:
@@ -227,11 +227,11 @@ def _open_run(run: str | Path | None, resume: bool, config: AttackConfig) -> Any
     None.
     """
     resumed = None
-    if resume and run is not None and is_run(run_path(run)):
-        resumed = run_path(run)
+    if resume and run is not None and is_run(locate_run(run)):
+        resumed = locate_run(run)
     context: Any = nullcontext(resumed)
     if run is not None and resumed is None:
-        context = begun(config)
+        context = create_before_work(config)
     return context
 
 

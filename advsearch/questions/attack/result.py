@@ -30,8 +30,8 @@ from advsearch.engine.record import MAX_STORED_IMAGES, RunState
 from advsearch.engine.rendering import Rendering, render
 from advsearch.errors import InputError
 from advsearch.questions.attack.summary import AlongDrive, AttackSummary
-from advsearch.report.figures import marked, new_axes, search_axes
-from advsearch.report.views import result_html, shown, side_by_side
+from advsearch.report.figures import draw_marks, draw_searches, new_axes
+from advsearch.report.views import get_view, join_images, make_notebook_html
 from advsearch.runs import files, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.scene.assembly import pose_mesh
@@ -43,7 +43,7 @@ from advsearch.scene.glb import encode_web_glb
 from advsearch.scene.settings import SettingValues
 from advsearch.settings import to_python
 from advsearch.tasks import Judgement, Mark
-from advsearch.trust.code import names_code
+from advsearch.trust.code import allow_code_of_call
 from advsearch.trust.writing import write_bytes
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ class AttackResult:
         rows = [row for row in self.rows("search") if row.phase != "ranking"]
         return [row.objective for row in rows if row.objective is not None]
 
-    @names_code
+    @allow_code_of_call
     @hold_process_lock()
     def render(
         self,
@@ -267,7 +267,7 @@ class AttackResult:
             axes: to draw on; None makes new ones.
         """
         axes = new_axes() if axes is None else axes
-        search_axes({self.summary.policy: self.history}, self.summary.objective, axes)
+        draw_searches({self.summary.policy: self.history}, self.summary.objective, axes)
         return axes
 
     def __repr__(self) -> str:
@@ -281,10 +281,10 @@ class AttackResult:
         )
 
     def _repr_html_(self) -> str:
-        return result_html(shown(self.summary), self.images)
+        return make_notebook_html(get_view(self.summary), self.images)
 
     def _repr_png_(self) -> bytes:
-        return side_by_side([*self.images.values()])
+        return join_images([*self.images.values()])
 
 
 # of all meshes that are written to turn; larger meshes are simplified
@@ -398,7 +398,7 @@ def save_images(
     """
     for name, image in scene_images.items():
         _save_scene_image(run, problem, name, image)
-    difference = files.difference(
+    difference = files.amplify_difference(
         scene_images["clean"].image, scene_images["adversarial"].image
     )
     run.save_image("difference", difference)
@@ -476,7 +476,7 @@ def save_with_marks(
 ) -> None:
     """Save an image with the marks of a task, if there are any."""
     if marks:
-        run.save_image(f"{name}-prediction", marked(picture.numpy(), marks))
+        run.save_image(f"{name}-prediction", draw_marks(picture.numpy(), marks))
 
 
 def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
@@ -676,7 +676,7 @@ def _render_frames(
             image = round_to_8_bit(problem.renderer(configuration, seed=seed, spp=spp))
         is_right, marks = problem.predict_with_marks(image, configuration)
         n_right += is_right
-        images.append(np.asarray(marked(image.numpy(), marks), dtype=np.float32))
+        images.append(np.asarray(draw_marks(image.numpy(), marks), dtype=np.float32))
     return images, n_right
 
 

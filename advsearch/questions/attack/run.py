@@ -51,7 +51,7 @@ from advsearch.questions.attack.stages import (
     plan_renders,
     verify_searches,
 )
-from advsearch.report.wording import count
+from advsearch.report.wording import format_count
 from advsearch.runs.directory import RunDirectory, check_free
 from advsearch.runs.twins import read_twins
 from advsearch.tasks import get_task_function
@@ -110,14 +110,14 @@ def run_attack(
     with ExitStack() as stack:
         run = None
         if resumed is not None:
-            run = stack.enter_context(RunDirectory.of(config, resumed))
+            run = stack.enter_context(RunDirectory.open(config, resumed))
         stages = Stages(progress)
         stages.begin("setup", PREPARING)
         problem = make_problem(parts)
         warnings = _report_warnings(parts, progress, problem, loading_notes)
         policy = choose_policy(parts.policy, problem, _gradient_setting(config))
         if run is None and parts.is_stored:
-            run = stack.enter_context(RunDirectory.of(config))
+            run = stack.enter_context(RunDirectory.open(config))
         if run is not None:
             check_digests(run, [model], find_user_functions(parts))
         with open_executor(config, WORKER, progress) as executor:
@@ -173,8 +173,8 @@ def _report_search_size(
     if problem.conditions is not None and is_size_chosen:
         progress.message(
             "One configuration for many conditions: "
-            f"{count(problem.steps, 'step')}, each over "
-            f"{count(problem.n_draws, 'condition')}; `steps` and `draws` change "
+            f"{format_count(problem.steps, 'step')}, each over "
+            f"{format_count(problem.n_draws, 'condition')}; `steps` and `draws` change "
             "that."
         )
 

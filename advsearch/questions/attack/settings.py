@@ -242,7 +242,7 @@ class AttackConfig(DerivativeConfig):
         "experiment tracker to which every evaluation is sent; its "
         "package has to be installed",
         otherwise="none",
-        power=powers.tracker,
+        power=powers.describe_tracker,
     )
     over: ControlsByName = setting_as_in(
         SceneConfig,
@@ -356,7 +356,7 @@ class AttackConfig(DerivativeConfig):
         unit="processes",
         ge=1,
         le=100_000,
-        power=powers.many_processes,
+        power=powers.describe_processes,
     )
     cluster: str | None = setting(
         None,
@@ -366,7 +366,7 @@ class AttackConfig(DerivativeConfig):
         metavar="PLACE",
         otherwise="this machine, if there are `workers`",
         min_length=1,
-        power=powers.connection,
+        power=powers.describe_connection,
     )
 
     @model_validator(mode="before")

@@ -25,9 +25,9 @@ from advsearch.attacks import (
     search,
 )
 from advsearch.attacks.candidates import (
-    ATTEMPTS,
-    MOST_CHECKS,
-    ROUNDS,
+    MAX_CHECKS,
+    MAX_CONFIRMATIONS,
+    MAX_SEARCHES,
     confirm_bracket,
     find_smallest_change,
 )
@@ -51,7 +51,7 @@ from advsearch.engine.transport import (
 from advsearch.engine.verifier import Verifier
 from advsearch.progress import Stages
 from advsearch.questions.attack.ambient import find_ambient
-from advsearch.report.wording import count
+from advsearch.report.wording import format_count
 from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
@@ -167,7 +167,7 @@ def _measure_gradients(
     gradients = planning.count_plan_gradients(renderer.plan, with_all=full)
     if gradients:
         hint = (
-            f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; "
+            f"{gradients} gradients of {format_count(problem.spp, 'sample')} a pixel; "
             "`measure=no` leaves it out"
         )
         stages.begin(
@@ -343,7 +343,7 @@ class Searches:
             shorter: which settings shorten it.
         """
         n_renders = count_planned_renders(steps, max_extra_repeats=self.close_looks)
-        samples = count(self.problem.spp, "sample")
+        samples = format_count(self.problem.spp, "sample")
         hint = f"{n_renders} pictures of {samples} a pixel; {shorter}"
         if self.findings.predictor is not None:
             n_traced = n_renders - steps
@@ -566,7 +566,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         transport = findings.predictor
 
     def search_inside(domain: Domain, number: int) -> Tensor:
-        title = f"search {number + 1} of at most {ROUNDS}"
+        title = f"search {number + 1} of at most {MAX_SEARCHES}"
         searches.begin("search", title, problem.steps, "`steps` shortens each search")
         result = searches.search(
             f"search {number}" if number else "search",
@@ -580,7 +580,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         # what was found if this is interrupted
         findings.search = findings.search or results[0]
         verifier.begin_stage(
-            "trying smaller changes", MOST_CHECKS * n_trials, at_most=True
+            "trying smaller changes", MAX_CHECKS * n_trials, at_most=True
         )
         return result.best_u
 
@@ -615,7 +615,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
     if bracket.u is not None:
         verifier.begin_stage(
             "checking the smallest change",
-            ATTEMPTS * n_repeats * n_trials,
+            MAX_CONFIRMATIONS * n_repeats * n_trials,
             at_most=True,
         )
     bracket = confirm_bracket(bracket, passes, problem.domain, times=n_repeats)

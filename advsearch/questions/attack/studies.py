@@ -52,7 +52,7 @@ from advsearch.questions.attack.summary import (
     MatrixRow,
     ObjectRow,
 )
-from advsearch.runs.directory import PARTS, default_name, is_run
+from advsearch.runs.directory import PARTS, is_run, make_default_name
 from advsearch.runs.results import INTERRUPTED
 from advsearch.runs.summary import read_configuration
 from advsearch.scene.library import list_objects, load_object
@@ -107,7 +107,7 @@ def _matrix_chains(config: AttackConfig) -> list[Chain]:
     for index, name in enumerate(names):
         changes = {} if config.ensemble else {"model": name}
         attack_config = AttackConfig.from_config(config, **changes)
-        directory = f"{index:02d}-" + default_name(name, [])
+        directory = f"{index:02d}-" + make_default_name(name, [])
         chains.append([StudyAttack(attack_config, directory, name)])
     return chains
 
@@ -128,7 +128,7 @@ def _curve_chains(config: AttackConfig) -> list[Chain]:
                 object=name,
                 epsilon=config.epsilon if epsilon is None else epsilon,
             )
-            directory = f"{index:02d}-" + default_name(name, words)
+            directory = f"{index:02d}-" + make_default_name(name, words)
             chain.append(StudyAttack(attack_config, directory, name, epsilon))
         chains.append(chain)
     return chains

@@ -30,21 +30,21 @@ from advsearch.runs.results import (
     StudyResult,
     VariedValue,
     VerifiedRate,
-    optional,
+    optional_field,
 )
-from advsearch.runs.summary import NAME, other_summary, read_result
+from advsearch.runs.summary import NAME, make_summary_error, read_result
 
 
 class FoundValue(DescribedValue):
     """One value of the adversarial configuration, and where it lies."""
 
-    clean: int | float | str | None = optional(
+    clean: int | float | str | None = optional_field(
         "the clean scene's; absent of several numbers"
     )
-    low: float | None = optional(
+    low: float | None = optional_field(
         "the least that the control allows; absent without a range"
     )
-    high: float | None = optional("the most")
+    high: float | None = optional_field("the most")
 
 
 class PicturedPrediction(Fields):
@@ -58,8 +58,8 @@ class PicturedPrediction(Fields):
     probability: JsonFloat | None = Field(
         description="of this prediction; of a detector the score of the box"
     )
-    payload: Payload = optional("what else the task keeps of it; absent without")
-    trial: int | None = optional(
+    payload: Payload = optional_field("what else the task keeps of it; absent without")
+    trial: int | None = optional_field(
         "number of the trial, the same for both pictures; "
         "absent where nothing was tried"
     )
@@ -164,7 +164,7 @@ class DifferentFailure(Fields):
     picture: str | None = Field(
         description="the first of these trials; null if there is none"
     )
-    pictured: PicturedPrediction | None = optional(
+    pictured: PicturedPrediction | None = optional_field(
         "of that picture; absent if there is none"
     )
 
@@ -195,7 +195,7 @@ class DifferentFailures(Fields):
     places: int | None = Field(
         description="cells that there are; null where there are none"
     )
-    share: FailingShare | None = optional("null where it can't be told")
+    share: FailingShare | None = optional_field("null where it can't be told")
     tried: int = Field(description="failures that were tried with fresh seeds")
     held: int = Field(description="of these, verified")
     listed: list[DifferentFailure] = Field(
@@ -280,7 +280,7 @@ class Printability(Fields):
     answer: PrintTerms | None = Field(
         description="of the adversarial scene; null if nothing was searched"
     )
-    cost: PrintCost | None = optional(
+    cost: PrintCost | None = optional_field(
         "what the terms cost in margin; null if nothing was verified"
     )
 
@@ -349,41 +349,45 @@ class AttackSummary(SceneResult):
     verified: VerifiedRate | None = Field(
         description="trials of the adversarial scene; null if nothing was verified"
     )
-    tried_objective: TriedObjective | None = optional("the objective over these trials")
-    baseline: BaselineSearch | None = optional(
+    tried_objective: TriedObjective | None = optional_field(
+        "the objective over these trials"
+    )
+    baseline: BaselineSearch | None = optional_field(
         "the random search; absent without `baseline`"
     )
-    answer_from: str | None = optional(
+    answer_from: str | None = optional_field(
         "`random` where the run's adversarial scene is the random search's"
     )
-    policy_verified: VerifiedRate | None = optional(
+    policy_verified: VerifiedRate | None = optional_field(
         "of what the policy itself found then"
     )
-    drive: AlongDrive | None = optional(
+    drive: AlongDrive | None = optional_field(
         "[along a drive](drives.md), with `over` a path; absent without"
     )
-    ambient: AmbientLight | None = optional(
+    ambient: AmbientLight | None = optional_field(
         "with [a projector](controls/projector.md) that is found: how much other light "
         "it bears"
     )
-    average: AverageCase | None = optional("only with `average`")
-    smallest: SmallestEpsilon | None = optional("only with `smallest`")
-    printability: Printability | None = optional("only with `printable`")
-    distribution: SearchDistribution | None = optional("of a policy that finds one")
-    failures: DifferentFailures | None = optional(
+    average: AverageCase | None = optional_field("only with `average`")
+    smallest: SmallestEpsilon | None = optional_field("only with `smallest`")
+    printability: Printability | None = optional_field("only with `printable`")
+    distribution: SearchDistribution | None = optional_field(
+        "of a policy that finds one"
+    )
+    failures: DifferentFailures | None = optional_field(
         "of a policy that looks for different ones"
     )
-    sample_count: VerificationSamples | None = optional("of the verification")
-    transport: LinearTransport | None = optional(
+    sample_count: VerificationSamples | None = optional_field("of the verification")
+    transport: LinearTransport | None = optional_field(
         "whether [a matrix of light transport](transport.md) predicted the searches' "
         "pictures"
     )
-    claimed: SearchClaim | None = optional("what the search itself believes")
-    gradients: SearchGradients | None = optional("of the search")
-    configuration: dict[str, FoundValue] | None = optional(
+    claimed: SearchClaim | None = optional_field("what the search itself believes")
+    gradients: SearchGradients | None = optional_field("of the search")
+    configuration: dict[str, FoundValue] | None = optional_field(
         "the adversarial configuration in a few values"
     )
-    shared: SharedWork | None = optional("only with `workers` or `cluster`")
+    shared: SharedWork | None = optional_field("only with `workers` or `cluster`")
     renders: dict[str, int] = Field(
         description="of the search, its gradients, the baseline and the verification; "
         "`unprinted`: of the search "
@@ -402,7 +406,7 @@ class AttackSummary(SceneResult):
     def brief(self) -> str:
         """The verified rate, or the prediction that is not verified yet."""
         if self.verified is None:
-            if self.goes_on and self.adversarial:
+            if self.is_unfinished and self.adversarial:
                 return f"{self.adversarial.label}, unverified"
             return ""
         return f"{self.verified.successes}/{self.verified.trials}"
@@ -417,17 +421,17 @@ class ObjectRow(Fields):
     object: str
     clean: ControlGroup | None
     ending: str | None = None
-    epsilon: EpsilonBudget = optional("of the last attack")
+    epsilon: EpsilonBudget = optional_field("of the last attack")
     flips_at: EpsilonBudget = Field(
         description="the least epsilon at which an adversarial scene was found; null: "
         "at none"
     )
     verified: VerifiedRate | None = None
-    margin: JsonFloat | None = optional("mean of the trials, in logits")
+    margin: JsonFloat | None = optional_field("mean of the trials, in logits")
     run: str | None = None
-    tried: float | None = optional("the largest epsilon that was tried")
-    average: AverageCase | None = optional("only with `average`")
-    renders: dict[str, int] | None = optional(
+    tried: float | None = optional_field("the largest epsilon that was tried")
+    average: AverageCase | None = optional_field("only with `average`")
+    renders: dict[str, int] | None = optional_field(
         "pictures by kind, of the attacks at all epsilons together"
     )
 
@@ -534,5 +538,5 @@ def load_attack_summary(folder: Path) -> AttackSummary:
     """Load the result of the attack in a run directory; errors as for `read_result`."""
     result = read_result(folder)
     if not isinstance(result, AttackSummary):
-        raise other_summary(folder / NAME, f"that of {result.command}")
+        raise make_summary_error(folder / NAME, f"that of {result.command}")
     return result

@@ -9,7 +9,7 @@ from pathlib import PurePath
 from advsearch.options import get_outcome
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.report import wording as words
-from advsearch.report.wording import count, number_text
+from advsearch.report.wording import format_count, format_number
 from advsearch.runs.results import VerifiedRate
 
 PATH = "path"  # the control whose conditions are moments
@@ -41,9 +41,9 @@ def attack_verdict(summary: AttackSummary) -> str:
     ending = summary.ending
     verified = summary.verified
     thing = _name_thing(summary)
-    after_steps = f"after {count(summary.steps, 'step')}"
+    after_steps = f"after {format_count(summary.steps, 'step')}"
     if ending == "already wrong":
-        wrong = words.calls(
+        wrong = words.format_mistake(
             summary.task, thing, summary.clean.label, get_outcome(summary.clean.payload)
         )
         return (
@@ -52,7 +52,9 @@ def attack_verdict(summary: AttackSummary) -> str:
         )
     if verified is None and ending == "interrupted" and summary.adversarial:
         outcome = get_outcome(summary.adversarial.payload)
-        predicts = words.calls(summary.task, thing, summary.adversarial.label, outcome)
+        predicts = words.format_mistake(
+            summary.task, thing, summary.adversarial.label, outcome
+        )
         return (
             f"Interrupted {after_steps}. What was found so far is not verified: the "
             f"model {predicts}."
@@ -60,7 +62,7 @@ def attack_verdict(summary: AttackSummary) -> str:
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} {after_steps}; nothing is verified."
     has_paths = summary.drive is not None and len(summary.drive.paths) > 1
-    rate = words.rate_text(verified) + condition_text(summary.over, has_paths)
+    rate = words.format_rate(verified) + condition_text(summary.over, has_paths)
     claim, goal = _clauses(summary, thing)
     if ending == "found":
         error = _error_clause(summary, verified, thing, claim)
@@ -134,7 +136,7 @@ def _clean_remark(summary: AttackSummary) -> str:
     n_failures = control.trials - control.correct
     if not n_failures:
         return ""
-    outcomes = words.outcomes_text(control.outcomes, summary.task)
+    outcomes = words.format_outcomes(control.outcomes, summary.task)
     outcomes = f" ({outcomes})" if outcomes else ""
     not_a_number = ""
     if control.not_a_number:
@@ -157,7 +159,7 @@ def _baseline_remark(summary: AttackSummary) -> str:
             f"did ({policy_rate.successes} of {policy_rate.trials} with a margin of "
             f"{policy_rate.margin:.2f}); that of the "
             "random search is the scene. The margin is "
-            f"{words.margin_text(summary.task)}."
+            f"{words.get_margin_meaning(summary.task)}."
         )
     if verified is None or random is None:
         return ""
@@ -266,7 +268,7 @@ def budget_text(summary: AttackSummary) -> str:
 def _within_text(name: str, epsilon: object, norm: object) -> str:
     if not isinstance(epsilon, (int, float)):
         return name
-    text = f"{name} within {number_text(epsilon)}"
+    text = f"{name} within {format_number(epsilon)}"
     return f"{text} ({norm})" if norm else text
 
 
@@ -294,7 +296,7 @@ def print_cost_text(summary: AttackSummary) -> str:
     return (
         f"margin {cost.margin_with:.3g} with the print terms, "
         f"{cost.margin_without:.3g} without (another search of "
-        f"{count(cost.steps, 'step')}, {cost.verified.trials} trials each): {cost_text}"
+        f"{format_count(cost.steps, 'step')}, {cost.verified.trials} trials each): {cost_text}"
     )
 
 
@@ -320,23 +322,25 @@ def _error_clause(
         return claim[:1].upper() + claim[1:]
     outcome = words.get_only_outcome(verified.outcomes)
     if len(labels) == 1:
-        predicts = words.calls(summary.task, thing, next(iter(labels)), outcome)
+        predicts = words.format_mistake(
+            summary.task, thing, next(iter(labels)), outcome
+        )
         return f"The model {predicts}"
     if labels:
         error = f"is wrong about {thing}"
         if summary.target:
             error = f"takes {thing} for one of the targets"
         if outcome is None and verified.outcomes:
-            outcomes = words.outcomes_text(verified.outcomes, summary.task)
+            outcomes = words.format_outcomes(verified.outcomes, summary.task)
             return f"The model {error} ({outcomes})"
         most_frequent = max(labels, key=lambda label: labels[label])
-        calling = words.calling(summary.task, most_frequent, outcome)
+        calling = words.format_mistake_participle(summary.task, most_frequent, outcome)
         return f"The model {error}, most often {calling},"
     if summary.task != words.CLASSIFICATION:
         return f"The model is wrong about {thing}"
     name = "something else"
     if summary.adversarial:
-        name = words.with_article(summary.adversarial.label)
+        name = words.add_article(summary.adversarial.label)
     return f"The model takes {thing} for something else ({name})"
 
 
@@ -369,7 +373,7 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
             "makes the commanded action leave its envelope",
         )
     if target:
-        targets = " or ".join(map(words.with_article, target))
+        targets = " or ".join(map(words.add_article, target))
         claim = f"predicts {target_names}"
         if summary.task == words.CLASSIFICATION:
             claim = f"calls {thing} {targets}"
@@ -377,15 +381,15 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
     claim = f"the model is wrong about {thing}"
     if summary.ending in _REASONS:
         claim = "it is wrong"
-    return claim, words.wanted(summary.objective, thing)
+    return claim, words.format_goal(summary.objective, thing)
 
 
 def method_texts(summary: AttackSummary) -> dict[str, str]:
     """Return how an attack came to its result, by name; empty texts are left out."""
     segments = summary.light_path_segments
     moved = [
-        f"{value.parameter} from {number_text(value.scene)} to "
-        f"{number_text(value.used)} {value.unit}".rstrip()
+        f"{value.parameter} from {format_number(value.scene)} to "
+        f"{format_number(value.used)} {value.unit}".rstrip()
         for value in summary.clean.moved
     ]
     facts = {
@@ -412,7 +416,7 @@ def _claim_text(summary: AttackSummary) -> str:
     if claimed is None:
         return ""
     text = (
-        f"{words.objective_name(summary.objective)} "
+        f"{words.get_objective_name(summary.objective)} "
         f"{_short(claimed.objective)} in the render that won"
     )
     if math.isfinite(claimed.re_evaluated):
@@ -452,9 +456,9 @@ def _rejected_text(summary: AttackSummary) -> str:
     if gradients is None or not (gradients.count or gradients.rejected):
         return ""
     return (
-        f"{count(gradients.cut, 'gradient')} with single outliers cut, "
+        f"{format_count(gradients.cut, 'gradient')} with single outliers cut, "
         f"{gradients.shortened} shortened as a whole, "
-        f"{count(gradients.rejected, 'step')} taken back"
+        f"{format_count(gradients.rejected, 'step')} taken back"
     )
 
 
@@ -463,8 +467,8 @@ def _non_finite_text(summary: AttackSummary) -> str:
     non_finite = summary.non_finite
     if not non_finite.objectives and not non_finite.gradient_elements:
         return ""
-    objectives = count(non_finite.objectives, "objective")
-    elements = count(non_finite.gradient_elements, "number")
+    objectives = format_count(non_finite.objectives, "objective")
+    elements = format_count(non_finite.gradient_elements, "number")
     return f"{objectives}, {elements} of gradients"
 
 
@@ -499,7 +503,7 @@ def transport_text(summary: AttackSummary) -> str:
         text = "every picture was rendered"
         return f"{text}: {transport.reason}" if transport.reason else text
     predictor = "light on surfaces" if transport.way == "surface light" else "a matrix"
-    n_predicted = count(summary.renders.get("products"), "picture")
+    n_predicted = format_count(summary.renders.get("products"), "picture")
     parts = [f"{predictor} predicted {n_predicted}"]
     if transport.error is not None:
         parts.append(
@@ -509,10 +513,10 @@ def transport_text(summary: AttackSummary) -> str:
             f"{_short(transport.error.logits)} of the objective"
         )
     if transport.renewed:
-        parts.append(f"made anew {count(transport.renewed, 'time')}")
+        parts.append(f"made anew {format_count(transport.renewed, 'time')}")
     if transport.seconds is not None:
         parts.append(
-            f"it and the comparisons took {words.seconds_text(transport.seconds)}"
+            f"it and the comparisons took {words.format_seconds(transport.seconds)}"
         )
     if transport.reason:
         parts.append(transport.reason)

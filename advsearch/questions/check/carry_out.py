@@ -159,7 +159,7 @@ class GradientCheck:
 
     def _measure_parts(self) -> Iterator[Finding]:
         for part in self.parts:
-            stored = self.measurements.stored(part.key)
+            stored = self.measurements.read(part.key)
             if stored is not None:  # measured before: nothing is loaded
                 yield from FINDINGS.validate_python(stored)
             else:

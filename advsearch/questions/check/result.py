@@ -148,8 +148,10 @@ class CheckResult(views.InNotebook, RunResult):
     )
     planned: int = Field(description="all parts")
     rows: list[CheckedRow]
-    plan: SearchPlan | None = results.optional("absent of `loss=linear` and of `all`")
-    bounces: results.PathLength | None = results.optional(
+    plan: SearchPlan | None = results.optional_field(
+        "absent of `loss=linear` and of `all`"
+    )
+    bounces: results.PathLength | None = results.optional_field(
         "how long the light paths of a long search are"
     )
     gains: list[GainRow] = Field(
@@ -242,22 +244,24 @@ def make_check_view(result: CheckResult) -> ShownResult:
         derivatives = [
             row for row in rows if row.loss == loss and row.quantity == "derivative"
         ]
-        sections.append(ResultPart.table(derivatives, DERIVATIVE_COLUMNS, title=title))
+        sections.append(
+            ResultPart.make_table(derivatives, DERIVATIVE_COLUMNS, title=title)
+        )
     gradient_rows = [row for row in rows if row.quantity == "gradient"]
     sections += [
-        ResultPart.table(
+        ResultPart.make_table(
             gradient_rows,
             GRADIENT_COLUMNS,
             title="The model's loss, cosine with the converged gradient",
         ),
-        ResultPart.table(
+        ResultPart.make_table(
             result.plan.groups if result.plan else [],
             GROUP_COLUMNS,
             title="How a search gets its derivatives",
             text=_reason_texts(result),
         ),
         ResultPart("Left out", _left_out_texts(result)),
-        ResultPart.table(result.gains, GAIN_COLUMNS, title="What that saves"),
+        ResultPart.make_table(result.gains, GAIN_COLUMNS, title="What that saves"),
     ]
     facts = {}
     if result.plan is not None:

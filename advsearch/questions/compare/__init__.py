@@ -174,7 +174,7 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
             "sweep", config.make_sweep_config().with_python_parts_of(config)
         )
         n_renders = sum(getattr(result, "renders", {}).values())
-        if not result.goes_on:
+        if not result.is_unfinished:
             sides = read_sides([RunDirectory.locate_part(context.run.path, "sweep")])
     else:
         progress.stage("reading rows")

@@ -44,7 +44,9 @@ class CountOf(results.Fields):
     @property
     def text(self) -> str:
         """The share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
-        return wording.share_of_text(self.count, self.total, self.interval, self.share)
+        return wording.format_fraction_of(
+            self.count, self.total, self.interval, self.share
+        )
 
 
 class PairCounts(results.Fields):
@@ -209,15 +211,15 @@ def make_compare_view(result: CompareResult) -> ShownResult:
         "": "{0.name}",
         "right in": "{0.correct} of {0.configurations}",
         "accuracy": lambda side: wording.percent(side.accuracy),
-        "95 % interval": lambda side: wording.interval_text(side.interval),
+        "95 % interval": lambda side: wording.format_interval(side.interval),
         "time a prediction": lambda side: format_prediction_time(side.seconds),
     }
     if any(side.outcomes for side in result.sides):
-        columns["the others"] = lambda side: wording.outcomes_text(
+        columns["the others"] = lambda side: wording.format_outcomes(
             side.outcomes, result.task
         )
     sections = [
-        ResultPart.table(result.sides, columns, title="How often each is right")
+        ResultPart.make_table(result.sides, columns, title="How often each is right")
     ]
     for pair in result.pairs:
         sections += _pair_sections(pair, has_others=len(result.pairs) > 1)
@@ -235,19 +237,21 @@ def format_prediction_time(seconds: float) -> str:
         return ""
     if seconds < 0.1:
         return f"{1000.0 * seconds:.2g} ms"
-    return wording.seconds_text(seconds)
+    return wording.format_seconds(seconds)
 
 
 def summarize_difference(pair: ComparedPair) -> str:
     """Summarise the difference of two sides in a sentence."""
     first_accuracy, second_accuracy = map(wording.percent, pair.accuracies)
     of_units = (
-        "" if pair.units is None else f" of {wording.count(pair.units, pair.unit)}"
+        ""
+        if pair.units is None
+        else f" of {wording.format_count(pair.units, pair.unit)}"
     )
     return (
         f"{pair.first} is right in {first_accuracy} and {pair.second} in "
         f"{second_accuracy} of the same "
-        f"{wording.count(pair.pairs, 'picture')}{of_units}: a difference of "
+        f"{wording.format_count(pair.pairs, 'picture')}{of_units}: a difference of "
         f"{100.0 * pair.difference:+.1f} points "
         f"(95 % interval {format_points_interval(pair.interval)})."
     )
@@ -337,7 +341,7 @@ def _part_cells(part: PairPart) -> list[str]:
     )
     alone = [str(part.first_only), str(part.second_only)]
     return [
-        wording.value_text(part.value),
+        wording.format_parameter_value(part.value),
         str(part.pairs),
         *accuracies,
         difference,
@@ -368,7 +372,7 @@ def _worse_texts(
         yield f"{where} no values stand out from chance."
     for index, rule in enumerate(rules):
         rest = "elsewhere" if index == 0 else "in what no rule before covers"
-        conditions = wording.conditions_text(rule.conditions)
+        conditions = wording.format_conditions(rule.conditions)
         yield (
             f"{where} {conditions}, in {rule.text} pairs; {rest} in "
             f"{rule.elsewhere.text}."
@@ -437,7 +441,7 @@ def make_compare_claims(result: CompareResult) -> Iterator[views.Claim]:
             f"difference is {method}."
         )
         side = next(side for side in result.sides if side.name == pair.second)
-        outcomes = wording.outcomes_text(side.outcomes, result.task)
+        outcomes = wording.format_outcomes(side.outcomes, result.task)
         if outcomes:
             statement += f" Of the others {pair.second} has {outcomes}."
         what = f"configurations in which {pair.second} is right"

@@ -128,7 +128,8 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
     ]
     names = [
         ", ".join(
-            wording.short_names(side.labels[column]) or "as it is" for column in columns
+            wording.shorten_names(side.labels[column]) or "as it is"
+            for column in columns
         )
         for side in sides
     ]
@@ -152,7 +153,7 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
     """
     sweep = workbench.StoredSweep.read(path)
     summary = sweep.summary
-    if summary.goes_on or summary.looked_at != summary.planned:
+    if summary.is_unfinished or summary.looked_at != summary.planned:
         raise errors.FileFormatError(
             f"{path}: expected a sweep that has ended, got one with "
             f"{summary.looked_at} of {summary.planned} "

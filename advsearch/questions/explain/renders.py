@@ -107,7 +107,7 @@ class Renders:
             RunDirectory.locate_part(self.context.run.path, name)
         )
         self._rendered[name] = sweep
-        self.interrupted = sweep.summary.goes_on
+        self.interrupted = sweep.summary.is_unfinished
         self.n_renders += sum(sweep.summary.renders.values())
         return None if self.interrupted else read_predictions([sweep])
 

@@ -21,8 +21,8 @@ class RightCounts(results.Fields):
         description="right ones of all; where rows share draws, the mean over draws of "
         "the share of each",
     )
-    outcomes: results.Outcomes = results.optional(
-        f"{results.WHAT_BECOMES} in the other ones; {results.ONLY_OF_BOXES}"
+    outcomes: results.Outcomes = results.optional_field(
+        f"{results.OUTCOME_TEXT} in the other ones; {results.ONLY_OF_BOXES}"
     )
 
     @property
@@ -32,8 +32,10 @@ class RightCounts(results.Fields):
         Of a detector also the outcomes of the others: ``... of 340 (250 missed, 49
         loose)``.
         """
-        share = wording.share_of_text(self.right, self.total, self.interval, self.share)
-        outcomes = wording.outcomes_text(self.outcomes)
+        share = wording.format_fraction_of(
+            self.right, self.total, self.interval, self.share
+        )
+        outcomes = wording.format_outcomes(self.outcomes)
         return f"{share} ({outcomes})" if outcomes else share
 
     def make_extent(self, counted_text: str) -> results.Extent:
@@ -208,7 +210,7 @@ IMPORTANCE_NOTE = (
 WEIGHT_COLUMNS: Mapping[str, views.Column] = {
     "parameters": lambda weight: " with ".join(weight.parameters),
     "decides": lambda weight: wording.percent(weight.share),
-    "95 % interval": lambda weight: wording.interval_text(weight.interval),
+    "95 % interval": lambda weight: wording.format_interval(weight.interval),
     "by parts": lambda weight: str(weight.parts or ""),
 }
 MAX_WEIGHTS = 12
@@ -231,14 +233,14 @@ def make_explain_view(result: ExplainResult) -> ShownResult:
     if result.rules:
         note = RULES_NOTE
         headline = (
-            f"{wording.count(len(result.rules), 'rule')} under which the model is "
+            f"{wording.format_count(len(result.rules), 'rule')} under which the model is "
             "wrong more often than elsewhere."
         )
     sections = [
         ResultPart(
             "Rules", [*rule_sentences, describe_rejected_rule(result)], note=note
         ),
-        ResultPart.table(
+        ResultPart.make_table(
             result.importance[:MAX_WEIGHTS],
             WEIGHT_COLUMNS,
             title="What decides",
@@ -289,7 +291,7 @@ def describe_rule_row(number: int, rule: RuleRow) -> str:
     """
     rest = "elsewhere" if number == 1 else "in what no rule before covers"
     text = (
-        f"{wording.conditions_text(rule.conditions)}: right in {rule.text}; {rest} "
+        f"{wording.format_conditions(rule.conditions)}: right in {rule.text}; {rest} "
         f"{rule.elsewhere.text}."
     )
     if rule.confirmed is None:
@@ -318,7 +320,7 @@ def describe_rejected_rule(result: ExplainResult) -> str:
     text = (
         f"Not told{' either' if result.rules else ''}, but the best that one half of "
         "the rows suggests: "
-        f"{wording.conditions_text(rule.conditions)}. In the other half the model is "
+        f"{wording.format_conditions(rule.conditions)}. In the other half the model is "
         f"right in {rule.right} of "
         f"{rule.total} under it and in {rule.elsewhere.right} of "
         f"{rule.elsewhere.total} elsewhere"
@@ -340,7 +342,7 @@ def describe_envelope(result: ExplainResult) -> str:
     box = result.envelope
     if box is None:
         return "No box of enough rows promises the accuracy that was asked for."
-    where = wording.conditions_text(box.conditions)
+    where = wording.format_conditions(box.conditions)
     if not box.held:
         return (
             f"Not shown: inside {where} the rows that did not choose it are right "
@@ -396,8 +398,8 @@ def make_explain_claims(result: ExplainResult) -> Iterator[views.Claim]:
         if rule.confirmed:
             source = "fresh renders"
         extent = counts.make_extent(f"right, of {source}")
-        where = f"{wording.conditions_text(rule.conditions)} (rule {number})"
-        inside = f"{wording.share_text(extent)} {source}"
+        where = f"{wording.format_conditions(rule.conditions)} (rule {number})"
+        inside = f"{wording.format_extent(extent)} {source}"
         statement = (
             f"Where {where} the model is right in {inside}; elsewhere in "
             f"{rule.elsewhere.text}."
@@ -406,10 +408,8 @@ def make_explain_claims(result: ExplainResult) -> Iterator[views.Claim]:
     box = result.envelope
     if box is not None and box.held and box.total:
         extent = box.make_extent("right, of rows that did not choose the box")
-        where = wording.conditions_text(box.conditions)
-        inside = (
-            f"{wording.share_text(extent)} configurations that did not choose this box"
-        )
+        where = wording.format_conditions(box.conditions)
+        inside = f"{wording.format_extent(extent)} configurations that did not choose this box"
         statement = (
             f"Inside {where} the model is right in {inside}; the sweeps drew no others."
         )

@@ -34,7 +34,7 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
                 full_names = rows[name].astype(object)
             else:
                 full_names = pd.Series(getattr(sweep.summary, name), rows.index)
-            rows[name] = full_names.map(wording.figure_value)
+            rows[name] = full_names.map(wording.format_figure_value)
         rows["draw"] = name_draws(sweep, rows)
         rows["image"] = name_images(sweep, rows)
         frames.append(rows.assign(sweep=index))

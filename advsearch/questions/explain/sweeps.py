@@ -240,7 +240,9 @@ def find_names(config: SweepConfig, setting: str, value: str) -> list[str]:
     """Return the names in a setting that rows write as `value`; else the first name."""
     setting_value = getattr(config, setting)
     names = settings.split_names(setting_value) if setting_value else ()
-    matching = [name for name in names if value in (name, wording.figure_value(name))]
+    matching = [
+        name for name in names if value in (name, wording.format_figure_value(name))
+    ]
     return matching or list(names[:1])
 
 

@@ -179,8 +179,8 @@ def check_same_arguments(run: RunDirectory, arguments: Mapping[str, Any]) -> Non
         InputError: the run began with others.
     """
     is_passed = {name: value is not None for name, value in arguments.items()}
-    was_passed = json.loads(run.store.note(ARGUMENTS_NOTE) or "{}")
-    run.store.set_note(ARGUMENTS_NOTE, json.dumps({**is_passed, **was_passed}))
+    was_passed = json.loads(run.store.read_note(ARGUMENTS_NOTE) or "{}")
+    run.store.write_note(ARGUMENTS_NOTE, json.dumps({**is_passed, **was_passed}))
     for name, passed_before in was_passed.items():
         if passed_before != is_passed[name]:
             preposition = "with" if passed_before else "without"
@@ -316,7 +316,7 @@ class Hardening:
         """Store whether an attack found a wrong prediction in a scene."""
         kind = f"{measurement} {control}"
         self.is_wrong[kind, number] = is_wrong
-        self.run.record_row(
+        self.run.append_row(
             kind,
             number,
             seed=seeds.stream(self.config.seed, f"measured {control}", number),

@@ -139,7 +139,7 @@ def read_coco(directory: Path, model: Model) -> list[Example]:
         examples = []
         for image in coco["images"]:
             file = _locate_image(image_directory, str(image["file_name"]), path)
-            pixels = torch.from_numpy(workbench.upright(file, MAX_SIZE))
+            pixels = torch.from_numpy(workbench.load_upright(file, MAX_SIZE))
             if pixels.shape[:2] != (image["height"], image["width"]):
                 raise ValueError(f"{image['file_name']} of another size than it says")
             boxes, labels = _read_boxes(annotations_of_image, image, label_of_category)

@@ -458,7 +458,7 @@ def _write_webdataset(directory: Path) -> None:
     `save_lesson_images`.
     """
     with (
-        writing.replacing(directory.with_suffix(".tar")) as temporary_path,
+        writing.replace_file(directory.with_suffix(".tar")) as temporary_path,
         tarfile.open(temporary_path, "w") as tar,
     ):
         for path in sorted(directory.glob("*/*.png")):

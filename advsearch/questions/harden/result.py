@@ -158,8 +158,8 @@ class Share(results.Fields):
     )
     right: int
     count: int
-    outcomes: results.Outcomes = results.optional(
-        f"of plain pictures, {results.WHAT_BECOMES} in the other ones; "
+    outcomes: results.Outcomes = results.optional_field(
+        f"of plain pictures, {results.OUTCOME_TEXT} in the other ones; "
         f"{results.ONLY_OF_BOXES}"
     )
 
@@ -337,14 +337,14 @@ def make_harden_view(result: HardenResult) -> ShownResult:
             height=110 + 44 * len(shares),
             **chart,
         ),
-        ResultPart.table(
+        ResultPart.make_table(
             enumerate(result.rounds),
             ROUND_COLUMNS,
             title="The training",
             note=TRAINING_NOTE,
             only="page",
         ),
-        ResultPart.table(
+        ResultPart.make_table(
             result.split.items(),
             SPLIT_COLUMNS,
             title="What it was trained and measured on",
@@ -384,7 +384,7 @@ def _share_cells(name: str, both: tuple[Share | None, Share | None]) -> list[str
         if share is None:
             cells += ["", ""]
         else:
-            interval = wording.interval_text(share.interval)
+            interval = wording.format_interval(share.interval)
             cells += [wording.percent(share.accuracy), interval]
     return cells
 
@@ -398,9 +398,9 @@ def _draw_shares(axes: Any, shares: ShareChanges, model: str) -> None:
         ]
         for name, both in shares.items()
     }
-    figures.draw_shares(axes, bars, ("before", "after"), (figures.RED, figures.BLUE))
+    figures.draw_fractions(axes, bars, ("before", "after"), (figures.RED, figures.BLUE))
     axes.set(xlabel="share that is right, with 95 % interval")
-    axes.set_title(f"Held-out scenes: {wording.short_name(model)}")
+    axes.set_title(f"Held-out scenes: {wording.shorten_name(model)}")
     axes.figure.legend(loc="outside lower center", ncols=2)
 
 
@@ -419,7 +419,7 @@ def _summarize(result: HardenResult) -> str:
         f"{clean_before.right}."
     )
     for when, share in (("Now", clean_after), ("Before", clean_before)):
-        outcomes = wording.outcomes_text(share.outcomes, result.task)
+        outcomes = wording.format_outcomes(share.outcomes, result.task)
         if outcomes:
             text += f" {when}, the other plain pictures are {outcomes}."
     if result.lost is not None:
@@ -445,7 +445,7 @@ def make_harden_claims(result: HardenResult) -> Iterator[views.Claim]:
                 f"{when}, the searches ({result.search}) found no failure in "
                 f"{share.right} of {share.count} "
                 f"({wording.percent(share.accuracy)}, 95 % interval "
-                f"{wording.interval_text(share.interval)}) held-out "
+                f"{wording.format_interval(share.interval)}) held-out "
                 "scenes. This does not show that there is none."
             )
             yield views.Claim.of(

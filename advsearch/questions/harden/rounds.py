@@ -238,7 +238,7 @@ class Rounds:
         self.progress = trainer.work.progress
         self.results = [
             TrainingRound.of(fields)
-            for fields in json.loads(run.store.note(ROUNDS_NOTE) or "[]")
+            for fields in json.loads(run.store.read_note(ROUNDS_NOTE) or "[]")
         ]
 
     @property
@@ -382,7 +382,7 @@ class Rounds:
             TrainingRound(lessons=n_trained, part=part, **score._asdict(), kept=False)
         )
         fields = [training_round.model_dump() for training_round in self.results]
-        self.run.store.set_note(ROUNDS_NOTE, json.dumps(fields))
+        self.run.store.write_note(ROUNDS_NOTE, json.dumps(fields))
         clean, worst = map(wording.percent, score)
         self.progress.message(
             f"round {number}: {clean} of plain pictures right, {worst} of the worst"

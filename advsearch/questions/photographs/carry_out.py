@@ -274,7 +274,7 @@ class Photographs:
                 cut_photo = result.sanitize_photo(data, image.size)
         with RunDirectory.resume(run) as resumed_run:
             kind = PHOTO if rendering else LOOSE_PHOTO
-            number = resumed_run.store.last_step(kind) + 1
+            number = resumed_run.store.get_last_step(kind) + 1
             photo = dict[str, JsonValue](source=source)
             rows = []
             for evaluator in self._load_evaluators(run):
@@ -291,7 +291,7 @@ class Photographs:
                 payload = {"photo": {**photo}, "answer": row.payload}
                 rows.append(replace(row, payload=payload))
             _write_photo(run, file, photo, cut_photo)
-            resumed_run.record(*rows)
+            resumed_run.append_rows(*rows)
 
 
 def _make_row(
@@ -377,7 +377,7 @@ class _PhotoEvaluator:
             InputError: the results have no row of a sweep's rendering.
         """
         if rendering.isdigit():
-            row = store.row("sweep", int(rendering) * self.n_models + self.index)
+            row = store.read_row("sweep", int(rendering) * self.n_models + self.index)
             if row is not None:
                 return bool(row.correct), row.label or "", row.values
         if file.suffix != ".png":

@@ -107,7 +107,7 @@ class PhotographPages:
         sent_key = headers.get(KEY, "").encode("utf-8", "replace")
         has_key = hmac.compare_digest(key.encode(), sent_key)
         if headers.get("Origin") is None or not has_key:
-            raise markup.Refused(
+            raise markup.RequestRejected(
                 HTTPStatus.FORBIDDEN,
                 "a photograph is sent by the page that this server shows; open it anew",
             )
@@ -125,4 +125,4 @@ def reject_invalid(status: HTTPStatus) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise markup.Refused(status, str(error)) from None
+        raise markup.RequestRejected(status, str(error)) from None

@@ -197,17 +197,17 @@ def make_align_page(
         key: that the server expects with a photograph.
         phone_address: address by which another device opens the page; None if none can.
     """
-    main = markup.element(
+    main = markup.make_element(
         "main",
         _align_section(renderings),
-        markup.element("h2", "Renderings and reality"),
-        markup.element("div", make_agreement_table(table), id="agreement"),
+        markup.make_element("h2", "Renderings and reality"),
+        markup.make_element("div", make_agreement_table(table), id="agreement"),
         None if phone_address is None else _phone_section(phone_address),
     )
-    header = markup.element(
+    header = markup.make_element(
         "header",
-        markup.element("p", "Photographs", class_="eyebrow"),
-        markup.element("h1", f"{run}, photographed"),
+        markup.make_element("p", "Photographs", class_="eyebrow"),
+        markup.make_element("h1", f"{run}, photographed"),
     )
     data = []
     scripts: tuple[str, ...] = ()
@@ -227,8 +227,8 @@ def _align_section(renderings: Sequence[str]) -> markup.Html:
             "This run kept no pictures to align with. An attack keeps them when it "
             "ends; a sweep with "
         )
-        return markup.element(
-            "p", reason, markup.element("code", "keep_pictures=all"), "."
+        return markup.make_element(
+            "p", reason, markup.make_element("code", "keep_pictures=all"), "."
         )
     names = ", ".join(renderings[:8])
     if len(renderings) > 8:
@@ -238,19 +238,21 @@ def _align_section(renderings: Sequence[str]) -> markup.Html:
         "agree, and take a photograph."
     )
     content = markup.join_html(
-        markup.element("p", instructions),
-        markup.element(
+        markup.make_element("p", instructions),
+        markup.make_element(
             "p",
             f"Renderings of this run ({len(renderings)}): {names}.",
             class_="soft",
             id="renderings",
         ),
-        markup.element(
+        markup.make_element(
             "noscript",
-            markup.element("p", "The camera needs JavaScript, which is switched off."),
+            markup.make_element(
+                "p", "The camera needs JavaScript, which is switched off."
+            ),
         ),
     )
-    return markup.element("div", content, id="align")
+    return markup.make_element("div", content, id="align")
 
 
 def _phone_section(address: str) -> markup.Html:
@@ -260,21 +262,21 @@ def _phone_section(address: str) -> markup.Html:
         title = "QR code of the address below"
         content = markup.Html(code.svg_inline(omitsize=True, light="#fff", title=title))
     else:
-        content = markup.element(
+        content = markup.make_element(
             "p", f"A code to point the phone at would stand here: {markup.NO_QR}"
         )
-    return markup.element(
+    return markup.make_element(
         "details",
-        markup.element("summary", "Open this page on a phone"),
-        markup.element("div", content, class_="qr"),
-        markup.element("pre", address, class_="wrap", tabindex="0"),
+        markup.make_element("summary", "Open this page on a phone"),
+        markup.make_element("div", content, class_="qr"),
+        markup.make_element("pre", address, class_="wrap", tabindex="0"),
     )
 
 
 def make_agreement_table(table: PhotoAgreement) -> markup.Html:
     """Return the counts of right and wrong predictions, in all and by rendering."""
     if not table.photos or table.interval is None:
-        return markup.element("p", "No photographs yet.", class_="soft")
+        return markup.make_element("p", "No photographs yet.", class_="soft")
     heads = ("photographs", "right in the photograph", "wrong in the photograph")
     counts = [
         ["right in the rendering", str(table.right_right), str(table.right_wrong)],
@@ -282,14 +284,16 @@ def make_agreement_table(table: PhotoAgreement) -> markup.Html:
     ]
     n_agreeing = table.right_right + table.wrong_wrong
     text = (
-        f"They agree in {n_agreeing} of {wording.count(table.photos, 'photograph')}: "
+        f"They agree in {n_agreeing} of {wording.format_count(table.photos, 'photograph')}: "
         f"{wording.percent(table.agreement)}, 95 % interval "
-        f"{wording.interval_text(table.interval)}."
+        f"{wording.format_interval(table.interval)}."
     )
     return markup.join_html(
-        markup.element("div", markup.make_table(heads, counts), class_="agreement"),
-        markup.element("p", text),
-        markup.element(
+        markup.make_element(
+            "div", markup.make_table(heads, counts), class_="agreement"
+        ),
+        markup.make_element("p", text),
+        markup.make_element(
             "div",
             _rendering_table(table.renderings),
             class_="scroll",
@@ -316,7 +320,7 @@ def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html
     for rendering in renderings:
         links = [
             markup.join_html(
-                markup.element(
+                markup.make_element(
                     "a", label or "nothing", href=f"photos/{markup.quote_name(file)}"
                 ),
                 " ",
@@ -335,7 +339,7 @@ def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html
                     f"{rendering.photos_right} of {n_photos} right: ", *links
                 ),
                 f"{rendering.agreeing} of {n_photos}",
-                wording.interval_text(rendering.interval),
+                wording.format_interval(rendering.interval),
             ]
         )
     addresses = [

@@ -134,7 +134,7 @@ class PrecisionPoint(results.Measured):
         default=False,
         description="a few pixels hold the error, so that it has no interval",
     )
-    wall_seconds: results.JsonFloat | None = results.optional(
+    wall_seconds: results.JsonFloat | None = results.optional_field(
         "by the clock; `seconds` are processor time"
     )
 
@@ -186,16 +186,16 @@ class Recommended(results.Fields):
     control: str
     family: str = ""
     goal: float | None = None
-    estimator: str | None = results.optional(
+    estimator: str | None = results.optional_field(
         "null where nothing that was measured reaches it"
     )
     spp: int | None = None
     seconds: results.JsonFloat | None = None
     error: results.JsonFloat | None = None
-    basis: str | None = results.optional(
+    basis: str | None = results.optional_field(
         "measured, fitted, interpolated, extrapolated or confirmed"
     )
-    repeats: int | None = results.optional("measurements that confirm it")
+    repeats: int | None = results.optional_field("measurements that confirm it")
 
 
 class Sitting(results.Fields):
@@ -296,7 +296,9 @@ def make_view(result: PrecisionResult) -> ShownResult:
     threads = " and ".join(
         f"{count} of {name}" for name, count in machine.threads.items()
     )
-    stopped = "It was stopped: only a part was measured. " if result.goes_on else ""
+    stopped = (
+        "It was stopped: only a part was measured. " if result.is_unfinished else ""
+    )
     return ShownResult(
         stopped + make_headline(result),
         [
@@ -312,12 +314,12 @@ def make_view(result: PrecisionResult) -> ShownResult:
                 _make_error_table(quantity, result.points)
                 for quantity in ("picture", "margin", "gradient")
             ),
-            ResultPart.table(
+            ResultPart.make_table(
                 result.slopes,
                 SLOPE_COLUMNS,
                 title="Slopes: logarithm of the error against that of samples",
             ),
-            ResultPart.table(
+            ResultPart.make_table(
                 result.references,
                 REFERENCE_COLUMNS,
                 title="References, with their own errors",
@@ -419,7 +421,7 @@ def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> Result
             f"{math.nan if point.cosine is None else point.cosine:.3f}"
         )
     columns["seconds"] = "{0.seconds:.3g}"
-    return ResultPart.table(
+    return ResultPart.make_table(
         rows, {**columns, "repeats": "{0.repeats}"}, title=quantity.capitalize()
     )
 
@@ -483,7 +485,7 @@ def draw_figures(result: PrecisionResult) -> figures.Figures:
         caption = _make_caption(result)
         figure.supxlabel(caption, fontsize=8, color=GREY, x=0.01, ha="left")
 
-    return figures.drawn(
+    return figures.render_figure(
         draw, (PANEL_SIZE[0] * n_columns, PANEL_SIZE[1] * n_rows + 0.8)
     )
 

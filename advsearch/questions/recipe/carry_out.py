@@ -104,11 +104,13 @@ def run_recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     if _read_noted_recipe(context) is None:
         check_recipe(recipe, config)
         check_figures(recipe, check_runs(runs), config.recipe)
-    context.run.store.set_note(RECIPE_NOTE, json.dumps(recipe.model_dump(mode="json")))
+    context.run.store.write_note(
+        RECIPE_NOTE, json.dumps(recipe.model_dump(mode="json"))
+    )
 
     done, warnings = _run_parts(runs, context)
     recipe_figures = list[RecipeFigure]()
-    if any(result.goes_on for _, result in done):
+    if any(result.is_unfinished for _, result in done):
         context.ending = results.INTERRUPTED
     elif config.photographs is not None:
         photographed = _select_photographed(recipe, [run for run, _ in done])
@@ -129,7 +131,7 @@ def _read_noted_recipe(context: RunContext[RecipeConfig]) -> dict[str, Any] | No
     if resumed is None or not Store.is_in(resumed):
         return None
     with Store.open_to_read(resumed) as store:
-        return store.noted(RECIPE_NOTE) or None
+        return store.read_json_note(RECIPE_NOTE) or None
 
 
 def _load_recipe(context: RunContext[RecipeConfig]) -> Recipe:
@@ -403,7 +405,7 @@ def _run_parts(
             )
         result = context.run_part(run.name, config)
         done.append((run, result))
-        if result.goes_on:
+        if result.is_unfinished:
             break
     return done, left_out
 
@@ -551,7 +553,7 @@ def _read_frame(
         recipe.groups,
         units=units,
         surfaces=surfaces,
-        cores=workbench.cores(),
+        cores=workbench.count_cores(),
         folder=recipe_run.path,
     )
 
@@ -615,4 +617,4 @@ def draw_files(figure_content: FigureContent) -> dict[str, bytes]:
         )
         figure_content.draw(figure)
 
-    return figures.drawn(draw, figure_content.size)
+    return figures.render_figure(draw, figure_content.size)

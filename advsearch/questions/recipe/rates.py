@@ -80,7 +80,7 @@ def read_rows(
     draws = None
     with Store.open_to_read(folder) as store:
         if summary.command == "sweep":
-            draws = workbench.units_of(store, is_drawn=summary.sampler is not None)
+            draws = workbench.read_units(store, is_sampled=summary.sampler is not None)
         for row in store.rows():
             if row.kind not in kinds:
                 continue
@@ -92,13 +92,13 @@ def read_rows(
             units |= {name: stored["unit"] for name, stored in row.values.items()}
             unit = f"{folder.name} {row.kind} {row.id}"
             if row.kind == "sweep" and draws is not None:
-                unit = f"{seed} {draws.of(row.step)}"
+                unit = f"{seed} {draws.find_unit(row.step)}"
             if summary.command == "attack":
                 values[TRIAL_COLUMN] = TRIAL_NAMES[row.kind]
                 unit = f"{seed} {row.step}"
             for name in ("object", "environment", MODEL_COLUMN):
                 value = values.get(name, getattr(summary, name))
-                values[name] = wording.figure_value(str(value))
+                values[name] = wording.format_figure_value(str(value))
             values[PREDICTION_COLUMN] = row.label or "none"
             values["correct"] = bool(row.correct)
             values["margin"] = row.margin
@@ -173,7 +173,7 @@ def split_rows(rows: Rows, name: str) -> dict[str, Rows]:
     """
     is_numeric = pd.api.types.is_numeric_dtype(get_column(rows, name))
     return {
-        wording.figure_value(value): group_rows
+        wording.format_figure_value(value): group_rows
         for value, group_rows in rows.groupby(name, sort=is_numeric)
     }
 
@@ -253,7 +253,7 @@ class ClusteredFraction:
         """
         share = (
             f"{wording.percent(self.fraction)}, 95 % interval "
-            f"{wording.interval_text(self.interval())}"
+            f"{wording.format_interval(self.interval())}"
         )
         return f"{verb} in {self.n_counted} of {self.total} ({share})"
 
@@ -402,7 +402,7 @@ class RatesOptions(Options):
         """The label of the axis: the column, or the distance from a value of it."""
         if self.away_from is None:
             return self.by
-        return f"the distance of {self.by} from {wording.figure_value(self.away_from)}"
+        return f"the distance of {self.by} from {wording.format_figure_value(self.away_from)}"
 
 
 def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
@@ -644,7 +644,7 @@ def _draw_rates(
         row_name: [tally.fraction_with_interval for tally in tallies]
         for row_name, tallies in bars.items()
     }
-    figures.draw_shares(axes, shares, series)
+    figures.draw_fractions(axes, shares, series)
     axes.set(xlabel=f"{label} with 95 % interval")
     if len(series) > 1:
         figure.legend(loc="outside lower center", ncols=min(len(series), 3))
@@ -687,7 +687,7 @@ def _group_rows(
     groups = dict[str, Rows]()
     centers = list[float]()
     for index, (start, end) in enumerate(pairwise(edges)):
-        bounds = f"{wording.figure_value(start)} to {wording.figure_value(end)}"
+        bounds = f"{wording.format_figure_value(start)} to {wording.format_figure_value(end)}"
         name = bounds + format_unit(rows, options.by)
         groups[name] = rows[bin_index == index]
         centers.append((start + end) / 2)
@@ -882,7 +882,7 @@ def _draw_agreement(figure: Any, bars: Cells, series: Sequence[str]) -> None:
         name: [tally.fraction_with_interval for tally in tallies]
         for name, tallies in bars.items()
     }
-    figures.draw_shares(axes, shares, series)
+    figures.draw_fractions(axes, shares, series)
     axes.set(xlabel="share that agrees, with 95 % interval")
     figure.legend(loc="outside lower center", ncols=1)
 
@@ -982,7 +982,7 @@ def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
         gains = _compute_gains(run_rates, rates_by_count)
         for name, rate in run_rates.items():
             table.append([workers, str(name), float(rate), gains.get(name)])
-    cores = wording.count(rows.attrs["cores"], "core")
+    cores = wording.format_count(rows.attrs["cores"], "core")
     text = _describe_scaling(rates_by_count)
     text.append(
         f"This machine gives {cores}; what other programs took of it meanwhile "
@@ -1015,7 +1015,7 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
     text = list[str]()
     for workers, run_rates in rates_by_count.items():
         sentence = (
-            f"{wording.count(workers, 'worker')}: "
+            f"{wording.format_count(workers, 'worker')}: "
             f"{_format_spread(run_rates)} pictures a second"
         )
         gains = _compute_gains(run_rates, rates_by_count)
@@ -1023,7 +1023,7 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
             efficiency = 100 * gains.median() * fewest / workers
             sentence += (
                 f", {_format_spread(gains)} times as many as "
-                f"{wording.count(fewest, 'worker')} ({efficiency:.0f} % of linear)"
+                f"{wording.format_count(fewest, 'worker')} ({efficiency:.0f} % of linear)"
             )
         text.append(f"{sentence}.")
     min_runs = min(map(len, rates_by_count.values()))
@@ -1053,7 +1053,7 @@ def _draw_scaling(
         counts,
         linear,
         color="0.7",
-        label=f"linear, from {wording.count(fewest, 'worker')}",
+        label=f"linear, from {wording.format_count(fewest, 'worker')}",
     )
     for workers, run_rates in rates_by_count.items():
         axes.plot(
@@ -1138,7 +1138,7 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
             table.append(
                 [
                     part.object,
-                    wording.short_name(part.model),
+                    wording.shorten_name(part.model),
                     part.part,
                     part.seen,
                     part.compared,

@@ -217,7 +217,7 @@ def make_view(result: RecipeResult) -> ShownResult:
     sections = [ResultPart(text=[result.about], only="page")]
     sections += _list_figures(result)
     sections.append(_list_runs(result.parts))
-    objects = ", ".join(map(wording.short_name, result.objects))
+    objects = ", ".join(map(wording.shorten_name, result.objects))
     environments = _shorten_names(result.environment)
     models = _shorten_names(result.model)
     facts = {
@@ -260,7 +260,7 @@ def _list_runs(parts: Sequence[RecipePart]) -> ResultPart:
     """Make the table of a recipe's runs."""
     rows = [[run.name, run.command, run.ending, str(run.renders)] for run in parts]
     return ResultPart(
-        wording.count(len(parts), "run"),
+        wording.format_count(len(parts), "run"),
         heads=("run in parts/", "command", "ending", "renders"),
         rows=rows,
         parts=[run.name for run in parts],
@@ -271,7 +271,7 @@ def _list_runs(parts: Sequence[RecipePart]) -> ResultPart:
 
 def _shorten_names(names: str) -> str:
     """Shorten each of the names that commas separate."""
-    return ", ".join(map(wording.short_name, names.split(",")))
+    return ", ".join(map(wording.shorten_name, names.split(",")))
 
 
 def _format_cell(column: str, value: Cell) -> str:

@@ -385,7 +385,7 @@ def draw_map(
         draw_margins(axes, rows, x_range, y_range)
         draw_outline(axes, *box)
 
-    for suffix, data in figures.figure_of(draw, (6.0, 4.6)).items():
+    for suffix, data in figures.render_axes(draw, (6.0, 4.6)).items():
         run.write_file(f"images/map.{suffix}", data)
     return MarginMap(axes=(x_range, y_range), margins=rows)
 
@@ -412,9 +412,9 @@ def draw_margins(
 ) -> None:
     """Draw margins and the line at which the verdict changes on matplotlib axes."""
     extent = (x_range.low, x_range.high, y_range.low, y_range.high)
-    x_title = figures.axis_title(x_range.name, x_range.unit)
-    y_title = figures.axis_title(y_range.name, y_range.unit)
-    figures.heat(axes, rows, extent, figures.MARGIN, x_title, y_title)
+    x_title = figures.format_axis_title(x_range.name, x_range.unit)
+    y_title = figures.format_axis_title(y_range.name, y_range.unit)
+    figures.draw_heat_map(axes, rows, extent, figures.MARGIN, x_title, y_title)
     margins = [margin for row in rows for margin in row]
     if min(margins) < 0.0 < max(margins):
         axes.contour(rows, levels=[0.0], extent=extent, colors="black", linewidths=1.0)

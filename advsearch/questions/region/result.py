@@ -141,7 +141,7 @@ class RegionResult(views.InNotebook, GrownRegion, results.SceneResult):
         description="what predicted pictures from new viewpoints; absent "
         "where no camera moves",
     )
-    renders: Annotated[dict[str, int], results.having("verification")] = Field(
+    renders: Annotated[dict[str, int], results.key_validator("verification")] = Field(
         description="of the `verification`: all that were rendered; of the `products`: "
         "all that were predicted"
     )
@@ -171,7 +171,7 @@ def make_region_view(result: RegionResult) -> ShownResult:
         f"The model is {result.verdict} in {result.same} of {result.samples} fresh "
         "samples of this box: with 95 % "
         f"confidence in at least {wording.percent(result.interval[0])} of it.",
-        [ResultPart.table(result.box, box, title="The box")],
+        [ResultPart.make_table(result.box, box, title="The box")],
         {
             "share of the space": wording.percent(result.volume),
             "samples a pixel": str(result.spp or ""),
@@ -197,7 +197,7 @@ def make_region_claims(result: RegionResult) -> Iterator[views.Claim]:
         for side in result.box or ()
     ]
     box = ", ".join(sides) or "the box"
-    inside = f"{wording.share_text(extent)} samples drawn evenly from it"
+    inside = f"{wording.format_extent(extent)} samples drawn evenly from it"
     statement = (
         f"Inside {box} the model is {result.verdict} in {inside}. Certified by "
         "sampling: single points of it may "

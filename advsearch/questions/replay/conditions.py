@@ -38,7 +38,7 @@ from advsearch.questions.replay.result import (
 )
 
 AttackResult = workbench.AttackResult
-Watched = workbench.Watched
+Watched = workbench.ProgressOption
 
 AS_VERIFIED = "as verified"
 """Name of the condition that changes nothing."""
@@ -327,7 +327,7 @@ def replay(
     if python_only:
         config = config.with_python_only_parts(python_only)
     result: ReplayResult = workbench.get_experiment("replay").run(
-        config, progress=workbench.watcher(progress), parts=parts
+        config, progress=workbench.as_progress(progress), parts=parts
     )
     return result
 

@@ -431,7 +431,7 @@ class _Process:
                 self._process = subprocess.Popen(
                     [*program, str(script), *separator, str(self._directory)],
                     cwd=self._directory,
-                    env=workbench.surroundings(str(self._directory)),
+                    env=workbench.make_environment(str(self._directory)),
                     stdin=subprocess.PIPE,
                     stdout=log,
                     stderr=log,
@@ -450,7 +450,7 @@ class _Process:
         """
         self._n_images += 1
         path = self._directory / f"{self._n_images}.exr"
-        time_limit = stored_files.scaled(MAX_RENDER_SECONDS)
+        time_limit = stored_files.scale_limit(MAX_RENDER_SECONDS)
         deadline = time.monotonic() + time_limit
         assert self._process.stdin is not None
         try:

@@ -205,8 +205,8 @@ def make_cells(row: ReplayRow) -> list[str]:
     return [
         row.way,
         condition,
-        *wording.rated_cells(row.clean),
-        *wording.rated_cells(row.verified),
+        *wording.format_rate_cells(row.clean),
+        *wording.format_rate_cells(row.verified),
         VERDICTS.get(row.ending, "does not hold"),
     ]
 
@@ -217,7 +217,7 @@ def make_replay_claims(result: ReplayResult) -> Iterator[views.Claim]:
         name = f"the adversarial scene of {PurePath(result.answer).name}, {row.way}"
         if row.way != row.condition:
             name += f": {row.condition}"
-        yield views.Claim.of_case(name, row.ending, row.verified)
+        yield views.Claim.from_case(name, row.ending, row.verified)
 
 
 def summarize_replay(result: ReplayResult) -> str:

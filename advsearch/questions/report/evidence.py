@@ -111,7 +111,7 @@ def count_conditions(
         if not total or interval is None:
             continue
         bounds = row.value if isinstance(row.value, tuple) else (row.value,)
-        value = " to ".join(map(wording.number_text, bounds))
+        value = " to ".join(map(wording.format_number, bounds))
         unit = "" if row.unit == "1" else row.unit
         conditions.append(
             ConditionShare(
@@ -237,7 +237,7 @@ def _criterion_of_claims(
                 f"{evaluate_criterion(criterion, extent.interval)} by {extent.count} "
                 "of "
                 f"{extent.total} {extent.what}, 95 % interval "
-                f"{wording.interval_text(extent.interval)}.{remark}"
+                f"{wording.format_interval(extent.interval)}.{remark}"
             )
     return lines
 
@@ -308,7 +308,7 @@ def describe_exposure(
         )
         lines.append(
             f"Weighted by {axis} ({fractions}): right in {wording.percent(mean)}, "
-            f"95 % interval {wording.interval_text((lower, upper))}."
+            f"95 % interval {wording.format_interval((lower, upper))}."
         )
     return lines
 
@@ -453,7 +453,7 @@ QUICK = (
 
 def collect_claims(result: results.Result) -> list[views.Claim]:
     """Return the claims of a run; a run without any has a reason."""
-    if result.goes_on:
+    if result.is_unfinished:
         is_running = getattr(result, "ending", "") == results.RUNNING
         reason = f"the run {'is running' if is_running else 'is not finished'}"
         if result.brief:
@@ -484,7 +484,7 @@ def list_photograph_claims(photos: Any) -> list[views.Claim]:
     )
     text = (
         "Photographs and renderings agree (both right, or both wrong) in "
-        f"{wording.share_text(extent)}."
+        f"{wording.format_extent(extent)}."
     )
     return [
         views.Claim(
@@ -574,7 +574,7 @@ def describe_run(
         settings=setting_texts,
         cost={
             "Renders": renders_text,
-            "Time": wording.seconds_text(seconds.get("total")),
+            "Time": wording.format_seconds(seconds.get("total")),
         },
         made_with=dict(versions) or {"versions and files": NOT_NOTED},
         command_line=str(values.get("command_line") or ""),
@@ -669,7 +669,7 @@ def _searched_by_sweep(result: workbench.SweepSummary) -> list[str]:
 
 def _format_axis_values(values: Sequence[Any]) -> str:
     """Format the values of an axis; bins as their range."""
-    text = ", ".join(map(wording.number_text, values))
+    text = ", ".join(map(wording.format_number, values))
     if all(isinstance(value, tuple) for value in values):  # bins of a range
         lower = min(low for low, _ in values)
         upper = max(high for _, high in values)
@@ -719,7 +719,7 @@ def _describe_measurement(
     formation = getattr(result, "image_formation", None)
     if formation:
         gains = getattr(result, "gains", None)
-        texts["Pictures"] = wording.formation_text(formation, gains)
+        texts["Pictures"] = wording.format_formation(formation, gains)
     return texts
 
 
@@ -740,10 +740,10 @@ def _describe_excluded(
                 f"{non_finite.gradient_elements} numbers of gradients."
             )
         for adjusted in result.clean.moved:
-            used = f"{wording.number_text(adjusted.used)} {adjusted.unit}"
+            used = f"{wording.format_number(adjusted.used)} {adjusted.unit}"
             lines.append(
                 f"The clean scene has {adjusted.parameter} {used} in place of "
-                f"{wording.number_text(adjusted.scene)}: the control leaves that out."
+                f"{wording.format_number(adjusted.scene)}: the control leaves that out."
             )
     if is_sweep(result) and result.not_finite:
         lines.append(
@@ -923,7 +923,9 @@ def _describe_stored_run(
     ]
     recorded = collect_settings(folder, result, read_paths)
     versions = _collect_versions(folder, result, read_paths)
-    run = describe_run(directory.typed_name(folder), result, claims, recorded, versions)
+    run = describe_run(
+        directory.format_run_name(folder), result, claims, recorded, versions
+    )
     return recorded, run
 
 
@@ -990,7 +992,7 @@ def _make_unfinished_run(folder: Path) -> EvidenceRun:
         "the run has no result yet: it is still working, or was stopped"
     )
     return EvidenceRun(
-        run=directory.typed_name(folder),
+        run=directory.format_run_name(folder),
         command=str(run_settings.get("command") or "unknown"),
         ending="none yet",
         claims=[claim],

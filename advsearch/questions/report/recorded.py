@@ -123,7 +123,7 @@ def describe_task(task: Any, objective: object) -> str:
         objective: an objective that defines success, or None.
     """
     options = ", ".join(
-        f"{option} {wording.number_text(value)}"
+        f"{option} {wording.format_number(value)}"
         for option, value in _task_options(task, objective).items()
     )
     if not options:
@@ -210,7 +210,7 @@ def collect_settings(
             for name, values in settings_by_name.items()
         ]
     return recorded + [
-        RecordedSettings(directory.typed_name(path), read_run_settings(path))
+        RecordedSettings(directory.format_run_name(path), read_run_settings(path))
         for path in read
     ]
 
@@ -257,6 +257,6 @@ def collect_versions(folder: Path, read: Sequence[Path]) -> dict[str, str]:
     parts = [part for part in candidates if directory.is_run(part)]
     for run in [folder, *parts, *read]:
         with suppress(errors.AdvsearchError):
-            for name, text in RunDirectory.read_made_with(run).items():
+            for name, text in RunDirectory.read_versions(run).items():
                 texts_of_name.setdefault(name, {})[str(text)] = None
     return {name: ", then ".join(texts) for name, texts in texts_of_name.items()}

@@ -97,7 +97,7 @@ class Evidence(results.Result):
     version: str = Field(description="of advsearch, that wrote this")
     written: str = Field("", description="when, UTC")
     by: str = Field("", description="who, as given; absent otherwise")
-    criterion: float | None = results.optional(
+    criterion: float | None = results.optional_field(
         "share of right predictions that was asked for; absent otherwise"
     )
 
@@ -116,7 +116,7 @@ def make_tables(
                     row.condition,
                     str(row.right),
                     str(row.total),
-                    wording.interval_text(row.interval),
+                    wording.format_interval(row.interval),
                 ]
                 for row in conditions
             ]
@@ -207,14 +207,18 @@ def make_evidence_page(
     n_carried = sum(claim.kind != "nothing claimed" for claim in claims)
     n_runs = len(evidence.runs)
     show = "shows" if n_runs == 1 else "show"
-    summary = f"What {wording.count(n_runs, 'run')} {show}, and no more than that."
-    rules = [markup.element("li", text.replace("`", "")) for text in evidence.rules]
-    main = markup.element(
+    summary = (
+        f"What {wording.format_count(n_runs, 'run')} {show}, and no more than that."
+    )
+    rules = [
+        markup.make_element("li", text.replace("`", "")) for text in evidence.rules
+    ]
+    main = markup.make_element(
         "main",
         *(_run_html(run, pictures or {}) for run in evidence.runs),
-        markup.element("h2", "How to read this"),
-        markup.element("ul", *rules),
-        markup.element("p", _describe_author(evidence), class_="soft"),
+        markup.make_element("h2", "How to read this"),
+        markup.make_element("ul", *rules),
+        markup.make_element("p", _describe_author(evidence), class_="soft"),
     )
     header = markup.make_header(
         f"evidence; {n_carried} of {len(claims)} statements carry a claim",
@@ -230,36 +234,42 @@ def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
     """Return a run: claims, pictures, tables and sections."""
     rows = _list_claim_rows(run)
     parts = [
-        markup.element("h2", f"{run.run} ({run.command})"),
+        markup.make_element("h2", f"{run.run} ({run.command})"),
         markup.make_table(CLAIM_HEADS, rows),
     ]
     parts += _list_images(run, pictures)
     for title, heads, cells in make_tables(run):
-        summary = markup.element("summary", f"{title} by condition, {len(cells)} rows")
+        summary = markup.make_element(
+            "summary", f"{title} by condition, {len(cells)} rows"
+        )
         parts.append(
-            markup.element("details", summary, markup.make_table(heads, cells))
+            markup.make_element("details", summary, markup.make_table(heads, cells))
         )
     facts = [
-        markup.element(
+        markup.make_element(
             "tr",
-            markup.element("th", name, scope="row"),
-            markup.element("td", *(markup.element("div", line) for line in lines)),
+            markup.make_element("th", name, scope="row"),
+            markup.make_element(
+                "td", *(markup.make_element("div", line) for line in lines)
+            ),
         )
         for name, lines in make_sections(run).items()
     ]
-    table = markup.element("table", markup.element("tbody", *facts), class_="facts")
+    table = markup.make_element(
+        "table", markup.make_element("tbody", *facts), class_="facts"
+    )
     parts.append(
-        markup.element(
+        markup.make_element(
             "details",
-            markup.element("summary", "On what, how, and what is left out"),
+            markup.make_element("summary", "On what, how, and what is left out"),
             table,
             open="",
         )
     )
     if run.command_line:
         parts += [
-            markup.element("h2", "Do it again"),
-            markup.element("pre", run.command_line, class_="wrap"),
+            markup.make_element("h2", "Do it again"),
+            markup.make_element("pre", run.command_line, class_="wrap"),
         ]
     return markup.join_html(*parts)
 
@@ -272,7 +282,7 @@ def _list_claim_rows(run: EvidenceRun) -> list[list[str]]:
         counted = (
             [
                 f"{extent.count} of {extent.total}",
-                wording.interval_text(extent.interval),
+                wording.format_interval(extent.interval),
             ]
             if extent
             else ["", ""]
@@ -291,8 +301,8 @@ def _list_images(run: EvidenceRun, pictures: Mapping[str, bytes]) -> list[markup
             if name in pictures
         }
         images = (
-            markup.element("figure", markup.element("img", src=url, alt=name))
+            markup.make_element("figure", markup.make_element("img", src=url, alt=name))
             for name, url in data.items()
         )
-        parts.append(markup.element("div", *images, class_="pictures"))
+        parts.append(markup.make_element("div", *images, class_="pictures"))
     return parts

@@ -159,8 +159,8 @@ class StabilityResult(views.InNotebook, results.Result):
     ending: str = Field(description="`done`, `interrupted` or `out of time`")
     rows: list[CaseRow]
     not_run: list[str] = Field(description="cases that were not begun")
-    seconds: Annotated[dict[str, results.JsonFloat], results.having("total")] = Field(
-        description="in `total`, of this sitting"
+    seconds: Annotated[dict[str, results.JsonFloat], results.key_validator("total")] = (
+        Field(description="in `total`, of this sitting")
     )
     command_line: str | None = Field(description="that asks the same again")
 
@@ -198,7 +198,7 @@ def make_view(result: StabilityResult) -> ShownResult:
     return ShownResult(
         f"{n_rows - len(failed)} of {n_rows} cases hold, in {seconds:.0f} seconds.",
         [
-            ResultPart.table(result.rows, CASE_COLUMNS, title="Cases"),
+            ResultPart.make_table(result.rows, CASE_COLUMNS, title="Cases"),
             ResultPart("Condition numbers", rows=condition_numbers),
             ResultPart("Short", failures),
             ResultPart("Not run", [", ".join(result.not_run)]),

@@ -753,7 +753,7 @@ def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
         )
         progress.stage("trying stiff and extreme scenes", len(cases), hint=hint)
         for planned in cases:
-            is_stored = measurements.stored(planned.name) is not None
+            is_stored = measurements.read(planned.name) is not None
             row = measurements.get_row(planned.name, CaseRow, planned.run)
             yield row
             if not is_stored:

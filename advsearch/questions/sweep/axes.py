@@ -672,9 +672,9 @@ class Points:
             count: of images.
         """
         if self.units.frames is None:
-            return draws.points(self.units.draw(first), count)
+            return draws.points(self.units.find_draw(first), count)
         points = [
-            draws.points(self.units.draw(number), 1)
+            draws.points(self.units.find_draw(number), 1)
             for number in range(first, first + count)
         ]
         return np.concatenate(points) if points else draws.points(0, 0)

@@ -28,7 +28,7 @@ from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import to_setting
-from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.progress import NullProgress, Progress, ProgressOption, as_progress
 from advsearch.questions.attack.carry_out import LOADING, is_named, open_executor
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
@@ -49,13 +49,13 @@ from advsearch.questions.sweep.tracks import Step
 from advsearch.runs.directory import (
     CONFIG,
     RunDirectory,
-    begun,
     check_free,
+    create_before_work,
     find_run,
     is_run,
-    run_path,
+    locate_run,
 )
-from advsearch.runs.listing import finished
+from advsearch.runs.listing import is_finished
 from advsearch.runs.summary import read_configuration
 from advsearch.runs.twins import read_twins
 from advsearch.scene.description import ENVIRONMENT
@@ -115,7 +115,7 @@ def sweep(
     metrics: Mapping[str, str | Metric] | None = None,
     tracker: Callable[[], Step] | None = None,
     run: str | Path | None = None,
-    progress: Watched = None,
+    progress: ProgressOption = None,
     **settings: Unpack[SweepKeywords],
 ) -> SweepResult:
     """Measure how often the model is right over a grid, random draws, or both.
@@ -186,7 +186,7 @@ def sweep(
         _find_python_only(config, networks, loaded, task, tracker, controls)
     )
     _check_config(config)
-    progress = watcher(progress)
+    progress = as_progress(progress)
     _check_can_use_workers(task, controls, networks, loaded, set_options)
     return _run_config(
         config,
@@ -382,7 +382,7 @@ def _run_config(
         check_free(config.run, overwrite=config.overwrite)
     context: Any = nullcontext(resumed)
     if config.run is not None and resumed is None:
-        context = begun(config)
+        context = create_before_work(config)
     if config.twins is not None:
         read_twins(config.twins)
     with context as directory:
@@ -408,12 +408,12 @@ def _find_resumable(config: SweepConfig) -> Path | None:
     """
     if config.run is None:
         return None
-    path = run_path(config.run)
+    path = locate_run(config.run)
     config_file = path / CONFIG
     if config.overwrite or not is_run(path) or not config_file.is_file():
         return None
     stored = SweepConfig.from_yaml(config_file, config.session_settings)
-    if stored.to_json() != config.make_repeatable().to_json() or finished(path):
+    if stored.to_json() != config.make_repeatable().to_json() or is_finished(path):
         return None
     return path
 
@@ -699,7 +699,7 @@ def _run_in_directory(
 ) -> SweepResult:
     """Run a sweep in its run directory, or continue it in the one of before."""
     with (
-        RunDirectory.of(config, resumed) as run,
+        RunDirectory.open(config, resumed) as run,
         open_executor(config, WORKER, progress) as executor,
     ):
         functions: dict[str, Callable[..., Any] | None] = {

@@ -37,11 +37,11 @@ from advsearch.report.figures import (
     BLUE,
     GREY,
     MARGIN,
-    MOST_POINTS,
+    MAX_POINTS,
     Figures,
-    axis_title,
-    figure_of,
-    heat,
+    draw_heat_map,
+    format_axis_title,
+    render_axes,
 )
 from advsearch.report.views import (
     Claim,
@@ -50,17 +50,17 @@ from advsearch.report.views import (
     ResultPart,
     ShownResult,
     claim,
-    counted,
-    extent_of,
-    share_text,
+    format_extent,
+    make_extent,
+    make_rate_extent,
 )
 from advsearch.report.wording import (
-    beside_text,
-    count,
-    margin_text,
+    format_count,
+    format_paired_rates,
+    format_prediction,
+    get_margin_meaning,
     percent,
-    prediction_text,
-    short_name,
+    shorten_name,
 )
 from advsearch.runs.results import INTERRUPTED, CountedPredictions
 from advsearch.settings import split_names
@@ -105,7 +105,7 @@ def draw_sweep(summary: SweepSummary) -> Figures:
     size = figure_size(summary)
     if size is None:
         return {}
-    return figure_of(lambda axes: draw_sweep_on(summary, axes), size)
+    return render_axes(lambda axes: draw_sweep_on(summary, axes), size)
 
 
 def draw_sweep_on(summary: SweepSummary, axes: Any) -> None:
@@ -125,7 +125,7 @@ def _only_axis(summary: SweepSummary) -> Sequence[AxisRow]:
     rows = [row for row in summary.axes if not isinstance(row.value, (list, tuple))]
     rows = rows or summary.axes
     names = {row.axis for row in rows}
-    return rows if len(names) == 1 and len(rows) <= MOST_POINTS else ()
+    return rows if len(names) == 1 and len(rows) <= MAX_POINTS else ()
 
 
 def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
@@ -140,13 +140,13 @@ def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
     else:
         measure = MARGIN
         values = np.array(cells.margin, dtype=float)
-    heat(
+    draw_heat_map(
         axes,
         values.tolist(),
         extent,
         measure,
-        axis_title(x_axis.axis, x_axis.unit),
-        axis_title(y_axis.axis, y_axis.unit),
+        format_axis_title(x_axis.axis, x_axis.unit),
+        format_axis_title(y_axis.axis, y_axis.unit),
     )
     rotation = 45 if _are_long(x_axis.values) else 0
     axes.set_xticks(*_ticks(x_axis.values), rotation=rotation)
@@ -179,7 +179,7 @@ def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) ->
     axes.plot(range(len(rows)), accuracy, "o", color=BLUE, label="accuracy")
     axes.set_xticks(*_ticks(values), rotation=45 if _are_long(values) else 0)
     axes.set(
-        xlabel=axis_title(rows[0].axis, rows[0].unit),
+        xlabel=format_axis_title(rows[0].axis, rows[0].unit),
         ylabel="accuracy",
         ylim=(-0.03, 1.03),
     )
@@ -199,13 +199,13 @@ def _ticks(values: Sequence[Any]) -> tuple[list[int], list[str]]:
 def _tick_label(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return " to ".join(f"{bound:.3g}" for bound in value)
-    return short_name(value) if isinstance(value, str) else f"{value:.4g}"
+    return shorten_name(value) if isinstance(value, str) else f"{value:.4g}"
 
 
 def _subject(summary: SweepSummary) -> str:
     """Return the names of the objects and the models."""
     names = (*split_names(summary.object), *split_names(summary.model))
-    return ", ".join(map(short_name, names))
+    return ", ".join(map(shorten_name, names))
 
 
 def _are_long(values: Sequence[Any]) -> bool:
@@ -234,13 +234,13 @@ def _difference_text(part: SurfacePart) -> str:
 
 AXIS_COLUMNS: dict[str, Column] = {
     "value": lambda row: (
-        wording.value_text(row.value)
+        wording.format_parameter_value(row.value)
         + (f" {row.unit}" if row.unit not in ("", "name") else "")
     ),
     "configurations": "{0.configurations}",
     "right": "{0.correct}",
     "accuracy": lambda row: percent(row.accuracy),
-    "95 % interval": lambda row: wording.interval_text(row.interval),
+    "95 % interval": lambda row: wording.format_interval(row.interval),
 }
 CHANGES_TITLE = "Shown again, changed:"
 CHANGE_COLUMNS: dict[str, Column] = {
@@ -248,7 +248,7 @@ CHANGE_COLUMNS: dict[str, Column] = {
     "what it says": lambda rates: rates.claim.replace("_", " "),
     "when": lambda rates: (BLIND | HARMLESS)[rates.when],
     "as claimed": "{0.correct} of {0.configurations}",
-    "95 % interval": lambda rates: wording.interval_text(rates.interval),
+    "95 % interval": lambda rates: wording.format_interval(rates.interval),
 }
 SURFACE_COLUMNS: dict[str, Column] = {
     "middle (u, v)": "{0.u:.3f}, {0.v:.3f}",
@@ -316,7 +316,9 @@ def _text_sections(
         yield ResultPart(text=[distance_sentence(distance)])
     for rates in summary.drives or ():
         yield ResultPart(drive_title(rates), heads=DRIVE_HEADS, rows=drive_rows(rates))
-    yield ResultPart.table(summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE)
+    yield ResultPart.make_table(
+        summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
+    )
     if axes.keys() - {"answer"}:
         introduction = READING
         if summary.beside:
@@ -349,7 +351,7 @@ def _arms_table(answer: str, pair: PairedRates, task: str) -> ResultPart:
         right = f"right in {counts.correct} of {counts.configurations}"
         row = [name, right, *_accuracy_cells(counts)]
         if has_outcomes:
-            row.append(wording.outcomes_text(counts.outcomes, task))
+            row.append(wording.format_outcomes(counts.outcomes, task))
         rows.append(row)
     return ResultPart(rows=rows)
 
@@ -360,10 +362,10 @@ def _worst_configuration(summary: SweepSummary) -> str:
         return ""
     values = summary.worst.values
     outside = [name for name in ("object", "environment", "model") if name in values]
-    texts = [short_name(values[name].value) for name in outside]
+    texts = [shorten_name(values[name].value) for name in outside]
     for name, described in values.items():
         if name not in outside:
-            texts.append(f"{name} {wording.value_text(described.value)}")
+            texts.append(f"{name} {wording.format_parameter_value(described.value)}")
     return ", ".join(texts)
 
 
@@ -374,9 +376,9 @@ def _worst_prediction(summary: SweepSummary) -> str:
         return ""
     verified = "not verified"
     if worst.verified:
-        verified = f"wrong in {wording.rate_text(worst.verified)}"
-    margin = f"margin ({margin_text(summary.task)}) {worst.claimed.margin:.3g}"
-    prediction = prediction_text(summary.task, worst.claimed)
+        verified = f"wrong in {wording.format_rate(worst.verified)}"
+    margin = f"margin ({get_margin_meaning(summary.task)}) {worst.claimed.margin:.3g}"
+    prediction = format_prediction(summary.task, worst.claimed)
     return f"prediction {prediction}; {margin}; {verified}"
 
 
@@ -410,17 +412,19 @@ def _page_parts(
             rows=drive_rows(rates),
             figure="images/drive.png" if is_first else "",
         )
-    yield ResultPart.table(summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE)
+    yield ResultPart.make_table(
+        summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
+    )
     if summary.surface is not None:
         yield from _surface_parts(summary.surface)
     for name, rows in axes.items():
         if len(rows) <= MAX_PAGE_ROWS:
             columns = dict(AXIS_COLUMNS)
             if any(row.outcomes for row in rows):
-                columns["the others"] = lambda row: wording.outcomes_text(
+                columns["the others"] = lambda row: wording.format_outcomes(
                     row.outcomes, summary.task
                 )
-            yield ResultPart.table(
+            yield ResultPart.make_table(
                 rows, columns, title=f"Accuracy by {name}", folded=True
             )
 
@@ -432,9 +436,9 @@ def _surface_parts(surface: SurfaceMap) -> Iterator[ResultPart]:
     yield ResultPart(title, [text], figure="images/surface.png")
     for table in surface.tables:
         if table.strongest:
-            names = f"{short_name(table.object)}, {short_name(table.model)}"
+            names = f"{shorten_name(table.object)}, {shorten_name(table.model)}"
             title = f"{names}: the {table.part}s that are told most clearly"
-            yield ResultPart.table(
+            yield ResultPart.make_table(
                 table.strongest, SURFACE_COLUMNS, title=title, folded=True
             )
 
@@ -454,9 +458,10 @@ def _verdict(summary: SweepSummary) -> str:
         )
     if summary.beside and summary.beside.pairs:
         return " ".join(
-            beside_text(summary.beside.answer, pair) for pair in summary.beside.pairs
+            format_paired_rates(summary.beside.answer, pair)
+            for pair in summary.beside.pairs
         )
-    configurations = count(summary.configurations, "configuration")
+    configurations = format_count(summary.configurations, "configuration")
     return (
         f"The model is right in {summary.correct} of {configurations} "
         f"({rate}){grid_clause(summary)}{outcomes}."
@@ -468,7 +473,7 @@ def outcomes_clause(summary: SweepSummary) -> str:
 
     Empty if only a prediction is known.
     """
-    text = wording.outcomes_text(summary.outcomes, summary.task)
+    text = wording.format_outcomes(summary.outcomes, summary.task)
     return f"; of the others, {text}" if text else ""
 
 
@@ -480,7 +485,7 @@ def grid_clause(summary: SweepSummary) -> str:
 
 
 def _accuracy_cells(counts: CountedPredictions) -> tuple[str, str]:
-    return percent(counts.accuracy), wording.interval_text(counts.interval)
+    return percent(counts.accuracy), wording.format_interval(counts.interval)
 
 
 def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
@@ -511,14 +516,14 @@ def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
         bar = "#" * round((row.accuracy or 0.0) * BAR_LENGTH)
         accuracy, interval = _accuracy_cells(row)
         cells = [
-            wording.value_text(row.value),
+            wording.format_parameter_value(row.value),
             bar.ljust(BAR_LENGTH, "."),
             accuracy,
             f"{row.correct} of {row.configurations}",
             interval,
         ]
         if has_outcomes:
-            cells.append(wording.outcomes_text(row.outcomes, task))
+            cells.append(wording.format_outcomes(row.outcomes, task))
         lines.append(cells)
     return ResultPart(title, rows=lines)
 
@@ -550,8 +555,8 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
         yield claim(
             "measured",
             "In the worst of these configurations the model is wrong in "
-            f"{wording.rate_text(verified)}. No search looked for a worse one.",
-            extent_of("wrong", verified),
+            f"{wording.format_rate(verified)}. No search looked for a worse one.",
+            make_rate_extent("wrong", verified),
         )
 
 
@@ -611,13 +616,13 @@ def _arm_claims(
         extent = _accuracy_extent(
             f"configurations of {arm} in which {pair.model} is right", counts
         )
-        accuracy = share_text(extent)
+        accuracy = format_extent(extent)
         yield claim(
             "measured",
             f"With {arm} {pair.model} is right in {accuracy} {population}.{note}",
             extent,
         )
-    yield claim("measured", beside_text(answer, pair), None)
+    yield claim("measured", format_paired_rates(answer, pair), None)
 
 
 def _accuracy_claims(
@@ -646,11 +651,11 @@ def _accuracy_claims(
         counts_by_model = {"The model": result}
     for model, counts in counts_by_model.items():
         extent = _accuracy_extent("configurations in which the model is right", counts)
-        outcomes = wording.outcomes_text(counts.outcomes, result.task)
+        outcomes = wording.format_outcomes(counts.outcomes, result.task)
         others = f" Of the others: {outcomes}." if outcomes else ""
         yield claim(
             "measured",
-            f"{model} is right in {share_text(extent)} {population}.{others}{note}",
+            f"{model} is right in {format_extent(extent)} {population}.{others}{note}",
             extent,
         )
 
@@ -662,7 +667,7 @@ def _drive_row_text(name: str, mean: str, interval: str, worst: str) -> str:
 
 
 def _accuracy_extent(description: str, counts: CountedPredictions) -> Extent:
-    return counted(
+    return make_extent(
         description,
         counts.correct,
         counts.configurations,
@@ -679,7 +684,7 @@ def rate_text(summary: SweepSummary) -> str:
     over = ", over drives" if summary.drives else ""
     return (
         f"{percent(summary.accuracy)}, 95 % interval "
-        f"{wording.interval_text(summary.interval)}{over}"
+        f"{wording.format_interval(summary.interval)}{over}"
     )
 
 
@@ -689,7 +694,7 @@ def drive_title(rates: DriveRates) -> str:
         f", {rates.repeats} times each with other noise" if rates.repeats > 1 else ""
     )
     title = (
-        f"{count(rates.drives, 'drive')} of {rates.frames} frames in {rates.seconds:g} "
+        f"{format_count(rates.drives, 'drive')} of {rates.frames} frames in {rates.seconds:g} "
         f"s{repeats}, {rates.model}"
     )
     return title if rates.answer is None else f"{title}, with {rates.answer}"
@@ -738,7 +743,7 @@ def surface_sentences(surface: SurfaceMap) -> list[str]:
     for table in surface.tables:
         if table.part != "cell":
             continue
-        cells = count(table.compared, table.part)
+        cells = format_count(table.compared, table.part)
         if not table.compared:
             text = (
                 f"no {table.part} was seen in {surface.least} pictures and hidden in "
@@ -758,7 +763,7 @@ def surface_sentences(surface: SurfaceMap) -> list[str]:
                     f"{wrong_text(first.seen)} that see it, "
                     f"{wrong_text(first.hidden)} that do not."
                 )
-        names = f"{short_name(table.object)}, {short_name(table.model)}"
+        names = f"{shorten_name(table.object)}, {shorten_name(table.model)}"
         sentences.append(f"{names}: {text}")
     return sentences
 

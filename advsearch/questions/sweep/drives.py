@@ -31,7 +31,7 @@ from advsearch.questions.sweep.summary import (
     TrackRates,
 )
 from advsearch.questions.sweep.tracks import DetectedFrame, read_frame, track_drive
-from advsearch.report.figures import marked
+from advsearch.report.figures import draw_marks
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.runs.tables import Units
@@ -273,7 +273,7 @@ class Drives:
 
         # Rows of one draw differ in noise alone: they are one drive.
         first_images = drives.steps[:, 0] // len(self._job.models)
-        drive = np.asarray(self._units.draw(first_images))
+        drive = np.asarray(self._units.find_draw(first_images))
         n_drives = len(np.unique(drive))
         n_right_drives = len(np.unique(drive[has_right]))
         max_gap = n_frames * self._frame_interval
@@ -422,7 +422,9 @@ class Drives:
             scene, (query, *_) = scenes.make_queries(number)
             image = scene.render_image(query)
             marks = scene.problems[0].find_marks(image, query.u)
-            frames.append(np.asarray(marked(image.numpy(), marks), dtype=np.float32))
+            frames.append(
+                np.asarray(draw_marks(image.numpy(), marks), dtype=np.float32)
+            )
         save_drive(run, "drive", frames, self.seconds)
 
 

@@ -67,7 +67,7 @@ from advsearch.questions.sweep.summary import (
     WorstVerified,
 )
 from advsearch.questions.sweep.surface import map_surface
-from advsearch.report.wording import count, repeats_remark
+from advsearch.report.wording import explain_repeats, format_count
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
 from advsearch.runs.files import write_layers
 from advsearch.runs.results import (
@@ -78,7 +78,7 @@ from advsearch.runs.results import (
     SharedWork,
 )
 from advsearch.runs.store import Row
-from advsearch.runs.tables import EDGES, NOTE
+from advsearch.runs.tables import EDGES_NOTE, UNITS_NOTE
 from advsearch.runs.twins import find_twin_evidence
 from advsearch.statistics.clustered import max_lower_bound
 from advsearch.tasks import Judgement
@@ -135,8 +135,8 @@ class Sweep:
                 for number in self._sampled_numbers
                 if number.edges
             }
-            run.store.set_note(EDGES, json.dumps(edges))
-            run.store.set_note(NOTE, json.dumps(asdict(self.units)))
+            run.store.write_note(EDGES_NOTE, json.dumps(edges))
+            run.store.write_note(UNITS_NOTE, json.dumps(asdict(self.units)))
         self._scenes = SceneLoader(job)
         if executor is None:
             self._executor: Workers = InProcess(
@@ -152,7 +152,7 @@ class Sweep:
         # what predicted images, by worker and scene
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
         self._has_non_finite = (
-            run is not None and run.store.note(NOT_FINITE) is not None
+            run is not None and run.store.read_note(NOT_FINITE) is not None
         )
         self._sweep_begin = 0.0
         self._last_report = 0.0
@@ -215,7 +215,7 @@ class Sweep:
         """Return the numbers of the rows that are not stored."""
         if self.run is None:
             return [range(self.n_rows)]
-        return list(self.run.store.missing(KIND, self.n_rows))
+        return list(self.run.store.find_missing_steps(KIND, self.n_rows))
 
     def _evaluate_rows(
         self, missing: Sequence[range], predictions: Predictions
@@ -256,7 +256,7 @@ class Sweep:
         """Return what the progress says of the work ahead."""
         hint = (
             f"{self.n_rows} predictions, pictures of "
-            f"{count(self.job.spp, 'sample')} "
+            f"{format_count(self.job.spp, 'sample')} "
             "a pixel; `resolution`, `spp` or fewer points shorten it"
         )
         keep = self.job.config.keep_pictures
@@ -292,7 +292,7 @@ class Sweep:
             return
         self._has_non_finite = True
         if self.run is not None:
-            self.run.store.set_note(NOT_FINITE, "yes")
+            self.run.store.write_note(NOT_FINITE, "yes")
 
     def _make_batches(self, missing: Sequence[range]) -> Iterator[list[WorkItem]]:
         """Yield the queries of missing rows in batches, none over two scenes.
@@ -437,7 +437,7 @@ class Sweep:
             return None
         rows: Iterable[Row | None] = self.journal.rows
         if self.run is not None:
-            rows = [self.run.store.row(KIND, row_number)]
+            rows = [self.run.store.read_row(KIND, row_number)]
         row = next(row for row in rows if row is not None and row.step == row_number)
         image, model = divmod(row_number, self.n_models)
         query = self.job.make_queries(range(image, image + 1))[model][2]
@@ -519,7 +519,7 @@ class Sweep:
         formation, gains = self._describe_formation()
         rows = np.flatnonzero(predictions.is_counted)
         right = predictions.is_right[rows]
-        units = self.units.of(rows)
+        units = self.units.find_unit(rows)
         axes = self._make_axes(rows)
         outcome = predictions.outcome[rows]
         changes = self._compute_change_rates()
@@ -648,7 +648,7 @@ class Sweep:
                 violations = rows[~is_claimed]
                 rates.append(
                     ChangeRates(
-                        **vars(count_by_unit(is_claimed, self.units.of(rows))),
+                        **vars(count_by_unit(is_claimed, self.units.find_unit(rows))),
                         model=network.name,
                         claim=claim,
                         when=change,
@@ -667,7 +667,7 @@ class Sweep:
         yield from make_lost_remarks(self._n_lost)
         yield from self.journal.remarks
         if self.units.noise > 1:
-            yield repeats_remark(
+            yield explain_repeats(
                 self.units.name, self.units.noise, self.n_rows // self.units.size
             )
         yield from self._drive_remarks()
@@ -703,7 +703,7 @@ class Sweep:
         elif 1 < n_drives < ENOUGH_DRIVES:
             lower_bound = max_lower_bound(n_drives)
             yield (
-                f"{count(n_drives, 'drive')} can show little: were the model right in "
+                f"{format_count(n_drives, 'drive')} can show little: were the model right in "
                 "all their frames, the interval of "
                 f"that share would begin at {100 * lower_bound:.0f} %."
             )
@@ -712,7 +712,7 @@ class Sweep:
         """Yield which predictions do not count, or not as right."""
         n_hidden = int(predictions.is_hidden.sum())
         if n_hidden:
-            images = count(int(predictions.is_known.sum()), "picture")
+            images = format_count(int(predictions.is_known.sum()), "picture")
             n_phantoms = predictions.n_phantoms_out_of_view
             phantoms = ""
             if n_phantoms:

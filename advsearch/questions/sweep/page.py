@@ -21,15 +21,15 @@ from advsearch.files import JsonObject, JsonValue
 from advsearch.questions.sweep.display import grid_clause, outcomes_clause, rate_text
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
-from advsearch.report.views import Html, element, join_html
-from advsearch.report.views import shown as make_view
-from advsearch.report.wording import beside_text, prediction_text
+from advsearch.report.views import Html, join_html, make_element
+from advsearch.report.views import get_view as make_view
+from advsearch.report.wording import format_paired_rates, format_prediction
 from advsearch.runs import directory
 from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
 from advsearch.trust.writing import (
     check_free_folder,
-    placed_by,
+    name_setting_in_errors,
     write_bytes,
     write_text,
 )
@@ -145,7 +145,7 @@ def make_sweep_page(
         if summary is not None:
             stills.append(_still_html(path, summary))
             parts += _page_parts_html(path, summary)
-    explorer = element("div", id="explorer", hidden="hidden")
+    explorer = make_element("div", id="explorer", hidden="hidden")
     if not explored:
         explorer = _too_many_rows_html(runs)
     needs_connection = any(
@@ -154,7 +154,7 @@ def make_sweep_page(
     return make_document(
         ", ".join(path.name for path, _ in runs),
         _header_html(runs),
-        element("main", explorer, *image_notes, *stills, *parts),
+        make_element("main", explorer, *image_notes, *stills, *parts),
         data=[make_data_script(descriptions, "runs"), *embedded_rows],
         scripts=["sweep.js"],
         connects=needs_connection,
@@ -190,7 +190,9 @@ def _embed_rows(rows: Any, element_id: str) -> Html:
     """Return a script element that holds rows, compressed."""
     zipped = gzip.compress(pack_columns(rows), 6, mtime=0)
     encoded = Html(base64.b64encode(zipped).decode())
-    return element("script", encoded, type="application/octet-stream", id=element_id)
+    return make_element(
+        "script", encoded, type="application/octet-stream", id=element_id
+    )
 
 
 def _describe_images(
@@ -216,17 +218,17 @@ def _describe_images(
         f"This file has {len(embedded):,} of the {n_thumbnails:,} pictures that were "
         "kept, those of the worst margins."
     )
-    return images, element("p", note, class_="soft")
+    return images, make_element("p", note, class_="soft")
 
 
 def _page_parts_html(path: Path, summary: SweepSummary) -> list[Html | None]:
     """Return what only a page shows of a sweep, and how its result came about."""
     view = make_view(summary)
     page_parts = [
-        part for part in view.sections if part.only == "page" and not part.empty
+        part for part in view.sections if part.only == "page" and not part.is_empty
     ]
     return [
-        *(make_part(path, part, view.said) for part in page_parts),
+        *(make_part(path, part, view.statement) for part in page_parts),
         make_end(path, summary, view),
     ]
 
@@ -262,7 +264,9 @@ def _header_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
     heading = "h1" if len(runs) == 1 else "h2"
     for path, summary in runs:
         if summary is None:
-            lines += [element(heading, f"{path.name}: this sweep has not ended yet")]
+            lines += [
+                make_element(heading, f"{path.name}: this sweep has not ended yet")
+            ]
             continue
         subject = subject_html(
             ("object", summary.object),
@@ -270,30 +274,30 @@ def _header_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
             ("model", summary.model),
         )
         lines += [
-            element("p", f"sweep {path.name}; ", subject, class_="eyebrow"),
-            element(heading, verdict_text(summary)),
+            make_element("p", f"sweep {path.name}; ", subject, class_="eyebrow"),
+            make_element(heading, verdict_text(summary)),
             remarks_html(summary.warnings),
         ]
-    title = element("h1", "Sweeps side by side") if len(runs) > 1 else None
-    return element("header", title, *lines)
+    title = make_element("h1", "Sweeps side by side") if len(runs) > 1 else None
+    return make_element("header", title, *lines)
 
 
 def _too_many_rows_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
     """Return what replaces the explorer in a file that would have too many rows."""
-    names = [directory.typed_name(path) for path, _ in runs]
+    names = [directory.format_run_name(path) for path, _ in runs]
     command = shlex.join(["advsearch", "dashboard", *names])
     counts = ", ".join(
         f"{summary.configurations:,}" for _, summary in runs if summary is not None
     )
-    return element(
+    return make_element(
         "p",
         f"This file leaves out the {counts} rows, and what pictures they have: it "
         f"takes {MAX_EMBEDDED_ROWS:,} along at most. ",
-        element("code", command),
+        make_element("code", command),
         " explores them all, and so does the folder that ",
-        element("code", "advsearch view"),
+        make_element("code", "advsearch view"),
         " makes with its option ",
-        element("code", "bundle"),
+        make_element("code", "bundle"),
         ".",
         class_="soft",
     )
@@ -307,7 +311,8 @@ def verdict_text(summary: SweepSummary) -> str:
         return "No configuration was looked at."
     if summary.beside and summary.beside.pairs:
         return " ".join(
-            beside_text(summary.beside.answer, pair) for pair in summary.beside.pairs
+            format_paired_rates(summary.beside.answer, pair)
+            for pair in summary.beside.pairs
         )
     so_far = ""
     if summary.looked_at != summary.planned:
@@ -334,11 +339,11 @@ def _still_html(path: Path, summary: SweepSummary) -> Html:
     figure = _figure_html(path / "images" / "sweep.png", f"{measure} over {axes}.")
     worst = _figure_html(path / "images" / "worst.png", _worst_caption(summary))
     return join_html(
-        element("div", figure, class_="pictures", data_still="true")
+        make_element("div", figure, class_="pictures", data_still="true")
         if figure
         else None,
-        element("h2", "The worst configuration") if worst else None,
-        element("div", worst, class_="pictures pair") if worst else None,
+        make_element("h2", "The worst configuration") if worst else None,
+        make_element("div", worst, class_="pictures pair") if worst else None,
     )
 
 
@@ -348,14 +353,16 @@ def _worst_caption(summary: SweepSummary) -> str:
     if worst is None:
         return ""
     values = ", ".join(
-        f"{name} {wording.number_text(described.value)}"
+        f"{name} {wording.format_number(described.value)}"
         for name, described in worst.values.items()
     )
     claim = worst.pictured or worst.claimed
-    text = f"{values}: the model predicts {prediction_text(summary.task, claim)}"
+    text = f"{values}: the model predicts {format_prediction(summary.task, claim)}"
     rate = worst.verified
     if rate is not None:
-        wrong = wording.tally("wrong", rate.successes, rate.trials, rate.not_a_number)
+        wrong = wording.format_tally(
+            "wrong", rate.successes, rate.trials, rate.not_a_number
+        )
         text += f"; {wrong} fresh renders"
     return f"{text}."
 
@@ -364,10 +371,10 @@ def _figure_html(file: Path, caption: str) -> Html | None:
     """Return a PNG file as a figure; None if there is no such file."""
     if not file.is_file():
         return None
-    image = element(
+    image = make_element(
         "img", src=make_data_url(file.read_bytes(), "image/png"), alt=caption
     )
-    return element("figure", image, element("figcaption", caption))
+    return make_element("figure", image, make_element("figcaption", caption))
 
 
 def load_sweep_result(run: Path) -> SweepSummary | None:
@@ -411,7 +418,7 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     sweeps = [
         (run, result) for run, result in results if isinstance(result, SweepSummary)
     ]
-    with placed_by("bundle"):
+    with name_setting_in_errors("bundle"):
         if len(results) == 1 and not sweeps:
             run, result = results[0]
             # Pages are made anew: what lies in the run may be anybody's.

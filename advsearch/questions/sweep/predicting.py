@@ -58,7 +58,7 @@ from advsearch.scene.surface.renderer import (
 )
 from advsearch.scene.transport.lights import BasisRenderer, LightBasis, find_lighting
 from advsearch.scene.transport.matrix import COLLECTED_SPP
-from advsearch.trust.stored_files import scaled
+from advsearch.trust.stored_files import scale_limit
 
 MIN_SAVING_FACTOR = 2.0
 """A group is predicted if rendering it takes this many times the samples of a
@@ -192,7 +192,7 @@ class BasisPictures:
             )
         height, width = renderer.formation.resolution
         n_bytes = groups.n_cached_groups * n_lights * 8 * height * width
-        if n_bytes > scaled(MAX_BYTES):
+        if n_bytes > scale_limit(MAX_BYTES):
             return Refusal(
                 f"basis pictures of {groups.n_groups} groups take too much memory; "
                 "make "
@@ -306,7 +306,7 @@ class LightOnSurfaces:
             arranged.n_cached_groups * ARRANGEMENT_BYTES
             + groups.n_cached_groups * light_bytes
         )
-        if n_bytes > scaled(MAX_BYTES):
+        if n_bytes > scale_limit(MAX_BYTES):
             return Refusal(
                 f"light of {groups.n_groups} groups takes too much memory; make the "
                 "camera the last axes of the grid"

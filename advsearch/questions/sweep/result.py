@@ -20,7 +20,7 @@ import pandas as pd
 
 from advsearch.errors import FileFormatError
 from advsearch.options import OUT_OF_VIEW, Outcome, get_outcome
-from advsearch.pictures import LARGEST_FILE, check_pixels, opened
+from advsearch.pictures import MAX_FILE_BYTES, check_pixels, open_image
 from advsearch.questions.sweep.display import draw_sweep, draw_sweep_on
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.page import write_sweep_page
@@ -32,9 +32,9 @@ from advsearch.questions.sweep.summary import (
     SweepSummary,
 )
 from advsearch.report.figures import new_axes
-from advsearch.report.views import result_html, shown
+from advsearch.report.views import get_view, make_notebook_html
 from advsearch.runs import store
-from advsearch.runs.directory import RunDirectory, default_name
+from advsearch.runs.directory import RunDirectory, make_default_name
 from advsearch.runs.export import read_threedb
 from advsearch.runs.results import CountedPredictions
 from advsearch.runs.tables import Units, read_sweep, to_pandas
@@ -215,7 +215,7 @@ class Predictions:
         for model, name in enumerate(models):
             images = np.flatnonzero(both_counted[:, model])
             if len(images):
-                draws = units.draw(images)
+                draws = units.find_draw(images)
                 pairs.append(
                     _compare_pairs(
                         name,
@@ -424,7 +424,7 @@ class SweepResult:
         )
 
     def _repr_html_(self) -> str:
-        return result_html(shown(self.summary))
+        return make_notebook_html(get_view(self.summary))
 
     def _repr_png_(self) -> bytes | None:
         return draw_sweep(self.summary).get("png")
@@ -448,7 +448,7 @@ def import_threedb(
     Raises:
         FileFormatError: the log of 3DB is empty or corrupt.
     """
-    default = default_name(folder.resolve().name, ["3db"])
+    default = make_default_name(folder.resolve().name, ["3db"])
     with RunDirectory.create(run, overwrite=overwrite, default=default) as directory:
         lines = read_threedb(folder)
         while batch := list(islice(lines, STORED_BATCH)):
@@ -456,7 +456,7 @@ def import_threedb(
                 if image_file is not None:
                     thumbnail = thumbnails.make_thumbnail(read_image(image_file))
                     thumbnails.write_thumbnail(directory.path, row.step, thumbnail)
-            directory.record(*(row for row, _ in batch))
+            directory.append_rows(*(row for row, _ in batch))
         rows = read_sweep(directory.path)
         if rows.empty:
             raise FileFormatError(
@@ -522,6 +522,6 @@ def _join_names(rows: pd.DataFrame, column: str) -> str:
 
 def read_image(path: Path) -> object:
     """Read an image file as float32 (H, W, 3), sRGB in [0, 1]."""
-    with opened(path, LARGEST_FILE) as image:
+    with open_image(path, MAX_FILE_BYTES) as image:
         check_pixels(path, *image.size, MAX_PIXELS)
         return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)

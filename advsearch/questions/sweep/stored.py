@@ -56,7 +56,7 @@ class StoredSweep:
         Raises:
             FileFormatError: they cannot be read.
         """
-        rows = read_sweep(self.folder, is_drawn=self.summary.sampler is not None)
+        rows = read_sweep(self.folder, is_sampled=self.summary.sampler is not None)
         return rows.sort_values("step", ignore_index=True)
 
     @cached_property

@@ -17,8 +17,8 @@ from advsearch.runs.results import (
     RunResult,
     VerifiedRate,
     as_fact,
-    having,
-    optional,
+    key_validator,
+    optional_field,
 )
 
 
@@ -57,7 +57,7 @@ class WorstClaim(Fields):
     index: int | None
     probability: JsonFloat | None
     margin: JsonFloat
-    payload: Payload = optional("what else the task keeps of it; absent without")
+    payload: Payload = optional_field("what else the task keeps of it; absent without")
 
 
 class WorstVerified(VerifiedRate):
@@ -76,14 +76,16 @@ class WorstConfiguration(Fields):
     """The configuration with the smallest margin."""
 
     configuration: int = Field(description="its number")
-    values: Annotated[dict[str, results.DescribedValue], having("object", "model")]
+    values: Annotated[
+        dict[str, results.DescribedValue], key_validator("object", "model")
+    ]
     seed: int
     label_set: list[str] = Field(description="the names that count as right there")
     claimed: WorstClaim = Field(description="of the sweep's own picture")
     verified: WorstVerified | None = Field(
         description="null where it was not rendered again"
     )
-    pictured: WorstClaim | None = optional(
+    pictured: WorstClaim | None = optional_field(
         "of the picture that is kept; absent without"
     )
 
@@ -253,7 +255,7 @@ class DriveRates(Fields):
     unit: str = Field(default="object sizes", description="of that distance")
     never_seen: int = Field(description="drives without a frame in which it is right")
     flicker: OverDrives = Field(description="changes between right and wrong a second")
-    tracks: TrackRates | None = optional(
+    tracks: TrackRates | None = optional_field(
         "what a [tracker](drives.md#tracks) makes of the boxes; absent without a "
         "detector"
     )
@@ -310,19 +312,19 @@ class SweepSummary(CountedPredictions, RunResult):
         description="over the first two axes with several values; null where there are "
         "fewer, or more than 4096 pairs"
     )
-    beside: ArmComparison | None = optional(
+    beside: ArmComparison | None = optional_field(
         "the clean scene beside [an adversarial "
         "one](sweeps.md#an-adversarial-scene-beside-the-clean-one); absent without"
     )
     worst: WorstConfiguration | None
-    drives: list[DriveRates] | None = optional(
+    drives: list[DriveRates] | None = optional_field(
         "of [whole drives](drives.md); absent where no frames of a path are swept"
     )
-    changes: list[ChangeRates] | None = optional(
+    changes: list[ChangeRates] | None = optional_field(
         "of [pictures that are also shown changed](sweeps.md#is-it-looking); absent "
         "unless asked"
     )
-    units: int | None = optional(
+    units: int | None = optional_field(
         "draws that the configurations are of, such as [drives](drives.md), and "
         "intervals over; absent "
         "where none share one"
@@ -330,7 +332,7 @@ class SweepSummary(CountedPredictions, RunResult):
     grid: dict[str, int] = Field(
         description="how many values each axis of the grid has"
     )
-    gains: dict[str, float] | None = optional(
+    gains: dict[str, float] | None = optional_field(
         "the gain of each scene, by object and environment; absent of one scene"
     )
     drawn: dict[str, results.VariedValue] = Field(
@@ -340,20 +342,20 @@ class SweepSummary(CountedPredictions, RunResult):
     samples: int = Field(description="draws at each point of the grid")
     sampler: str | None = Field(description="of the draws; null without any")
     spp: int = Field(description="samples a pixel")
-    renders: Annotated[dict[str, int], having("sweep")] = Field(
+    renders: Annotated[dict[str, int], key_validator("sweep")] = Field(
         description="of the sweep and of the verification; `products`: predicted "
         "instead"
     )
-    transport: results.LinearTransport | None = optional(
+    transport: results.LinearTransport | None = optional_field(
         "whether [basis pictures](transport.md#light) or [light on "
         "surfaces](surface-light.md#sweeps) "
         "predicted pictures; absent where neither light nor camera moves"
     )
-    surface: SurfaceMap | None = optional(
+    surface: SurfaceMap | None = optional_field(
         "which parts of the [surface](sweeps.md#the-surface), when seen, go with wrong "
         "predictions; absent unless asked"
     )
-    shared: results.SharedWork | None = optional(
+    shared: results.SharedWork | None = optional_field(
         "how [workers](cluster.md) did that shared the work; absent without"
     )
     renders_per_second: float | None = Field(

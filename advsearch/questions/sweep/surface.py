@@ -30,8 +30,8 @@ from advsearch.progress import Progress
 from advsearch.questions.sweep.job import Job, SceneLoader
 from advsearch.questions.sweep.result import count_independent
 from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
-from advsearch.report.figures import drawn
-from advsearch.report.wording import short_name
+from advsearch.report.figures import render_figure
+from advsearch.report.wording import shorten_name
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.scene.assets import BoolArray, IntArray, ObjectAsset
@@ -445,7 +445,7 @@ def _draw_of_images(
     """Return the draw of each image, (scenes, images of a scene)."""
     units = scenes.load(0).points[job.image_sizes[0]].units
     image_numbers = np.arange(wrong[..., 0].size)
-    return np.asarray(units.draw(image_numbers)).reshape(wrong.shape[:2])
+    return np.asarray(units.find_draw(image_numbers)).reshape(wrong.shape[:2])
 
 
 def _make_part_counts(
@@ -622,7 +622,7 @@ def _make_panels(
     ):
         cells = frames["cell"]
         yield Panel(
-            f"{short_name(object_name)}, {short_name(model)}",
+            f"{shorten_name(object_name)}, {shorten_name(model)}",
             _grey_colors(counts.parts, tally, cells),
             cells.difference.where(cells.significant).to_numpy(),
             views,
@@ -631,7 +631,7 @@ def _make_panels(
 
 def _save_figure(panels: Sequence[Panel], run: RunDirectory) -> None:
     size = (10.0, 0.5 + 3.6 * len(panels))
-    figures = drawn(partial(_draw, panels), size, kinds=("png",))
+    figures = render_figure(partial(_draw, panels), size, kinds=("png",))
     for suffix, data in figures.items():
         write_bytes(run.path / "images" / f"surface.{suffix}", data)
 

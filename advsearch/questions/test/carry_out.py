@@ -118,7 +118,7 @@ def _read_noted_suite(resumed: Path | None) -> Suite | None:
     if resumed is None or not Store.is_in(resumed):
         return None
     with Store.open_to_read(resumed) as store:
-        noted = store.noted(SUITE_NOTE)
+        noted = store.read_json_note(SUITE_NOTE)
     if noted is None:
         return None
     return settings.parse_suite(noted, f"{resumed}: the suite that it began with")
@@ -140,13 +140,13 @@ def _note_settings(
     them.
     """
     run = context.run
-    run.store.set_note(SUITE_NOTE, json.dumps(suite.model_dump(mode="json")))
+    run.store.write_note(SUITE_NOTE, json.dumps(suite.model_dump(mode="json")))
     judged_with = {
         claim.name: claim.config.get_deciding_settings()
         for claim in planned
         if claim.example is not None
     }
-    run.store.set_note(SETTINGS_NOTE, json.dumps(judged_with))
+    run.store.write_note(SETTINGS_NOTE, json.dumps(judged_with))
     used_settings = list[dict[str, Any]]()
     for claim in planned:
         used_settings.append(claim.config.to_json())
@@ -197,7 +197,7 @@ class _SuiteRun:
         """Test a claim, or return why it is not tested, or its noted result."""
         key = f"claim {claim.name}"
         trial = self.trial
-        noted = trial.run.store.noted(key)
+        noted = trial.run.store.read_json_note(key)
         if noted is not None:
             return ClaimResult.of(noted)
         counterexample_failed = any(
@@ -225,7 +225,7 @@ class _SuiteRun:
             raise KeyboardInterrupt
         tested = tested.model_copy(update={"seconds": time.perf_counter() - start})
         if tested.cause is not Cause.OUT_OF_TIME:
-            trial.run.store.set_note(key, json.dumps(tested.to_dict()))
+            trial.run.store.write_note(key, json.dumps(tested.to_dict()))
         return tested
 
     def _make_untested(

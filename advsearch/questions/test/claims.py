@@ -553,7 +553,7 @@ class ClaimTester:
         texts = []
         for name, value in values[:MAX_DESCRIBED_VALUES]:
             unit = "" if value["unit"] in ("1", "name") else f" {value['unit']}"
-            texts.append(f"{name} {wording.number_text(value['value'])}{unit}")
+            texts.append(f"{name} {wording.format_number(value['value'])}{unit}")
         if len(values) > MAX_DESCRIBED_VALUES:
             texts.append("...")
         return ", ".join(texts)
@@ -623,7 +623,7 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
         raise InputError(
             f"claims.{name}.pictures: expected at least {needed}, as fewer cannot both "
             "hold and fail this claim at a "
-            f"confidence of {wording.number_text(confidence)} whatever the model "
+            f"confidence of {wording.format_number(confidence)} whatever the model "
             f"predicts, got {claim.pictures}"
         )
     if not isinstance(claim, NoWorseClaim):
@@ -726,7 +726,7 @@ def _picture_reason(
     outcomes = ""
     if isinstance(claim, RightClaim):
         what = "right"
-        outcomes = wording.outcomes_text(
+        outcomes = wording.format_outcomes(
             workbench.count_outcomes(wrong_payloads), problem.task.name
         )
     return words.describe_fraction(
@@ -769,7 +769,7 @@ def _trials_result(
         label,
         interval,
         over=over,
-        outcomes=wording.outcomes_text(
+        outcomes=wording.format_outcomes(
             workbench.count_outcomes(wrong_payloads), problem.task.name
         ),
     )

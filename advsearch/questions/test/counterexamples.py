@@ -271,7 +271,7 @@ class Counterexample:
         """Return the name of a file in its settings that has changed, None if none
         has.
         """
-        return directory.summary.changed_file(
+        return directory.summary.find_changed_file(
             self.files, select_deciding_settings(config)
         )
 
@@ -450,7 +450,7 @@ def _make_values(
         "run": path.name,
         "said": next(iter(verified.labels), ""),
         "settings": make_paths_relative(stored_settings),
-        "files": directory.summary.file_digests(deciding),
+        "files": directory.summary.compute_file_digests(deciding),
         "scene": compute_scene_digest(parts.scene.description),
         "spp": verified.spp,
     }

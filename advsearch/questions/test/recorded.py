@@ -25,8 +25,8 @@ def read_noted_settings(
     noted suite cannot be read.
     """
     with Store.open_to_read(run) as store:
-        suite = store.noted(SUITE_NOTE)
-        examples = store.noted(SETTINGS_NOTE)
+        suite = store.read_json_note(SUITE_NOTE)
+        examples = store.read_json_note(SETTINGS_NOTE)
     not_tried = (Cause.COUNTEREXAMPLE_FAILED, Cause.NOT_REACHED)
     tried = {claim.name for claim in result.claims if claim.cause not in not_tried}
     settings: dict[str, dict[str, Mapping[str, Any]]] = {}

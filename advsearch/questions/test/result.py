@@ -67,29 +67,29 @@ class ClaimResult(results.Fields):
         HELD, description="what it said when `update` was given last; absent for `held`"
     )
     pictures: int = Field(0, description="that it took; absent if none")
-    rate: results.JsonFloat | None = results.optional(
+    rate: results.JsonFloat | None = results.optional_field(
         "share of right predictions, or of pictures as claimed; of two models the "
         "difference; absent of a search"
     )
-    interval: results.Interval | None = results.optional(
+    interval: results.Interval | None = results.optional_field(
         "of it: each end holds at all times together, at the suite's confidence; of a "
         "counterexample that "
         "of Clopper and Pearson, 95 %"
     )
-    spp: int | None = results.optional(
+    spp: int | None = results.optional_field(
         "samples a pixel of the pictures; absent of a search"
     )
-    picture: str | None = results.optional(
+    picture: str | None = results.optional_field(
         "a picture that the model gets wrong, in the run's folder"
     )
-    part: str | None = results.optional(
+    part: str | None = results.optional_field(
         "the run in `parts` that has the search; absent without one"
     )
     repeat: str = Field(
         "", description="the command that repeats it; absent where there is none"
     )
     seconds: results.JsonFloat = Field(0.0, description="that it took")
-    cause: Cause | None = results.optional(
+    cause: Cause | None = results.optional_field(
         "`counterexample failed`, `interrupted`, `not reached` or `out of time`: why "
         "it is undecided; absent elsewhere"
     )
@@ -117,7 +117,7 @@ class SuiteResult(views.InNotebook, RunResult):
         description="of each claim that is decided by drawn pictures"
     )
     claims: list[ClaimResult]
-    added: str | None = results.optional(
+    added: str | None = results.optional_field(
         "the file of the counterexample that was added; only with `add`"
     )
     changes: list[str] = Field(
@@ -192,8 +192,8 @@ def make_view(result: SuiteResult) -> ShownResult:
 
 def describe_claim(claim: AnyClaim, config: SceneConfig) -> str:
     """Describe what is claimed in a sentence."""
-    model = wording.short_name(config.model)
-    what = f"{wording.short_name(config.object)}, {', '.join(config.controls)}"
+    model = wording.shorten_name(config.model)
+    what = f"{wording.shorten_name(config.object)}, {', '.join(config.controls)}"
     if isinstance(claim, RightClaim):
         pictures = "the frames" if "path" in config.controls else "the pictures"
         share = (
@@ -212,8 +212,8 @@ def describe_claim(claim: AnyClaim, config: SceneConfig) -> str:
         )
         return f"{model} {says} when {when}: {what}"
     if isinstance(claim, NoWorseClaim):
-        points = f"{wording.number_text(claim.points)} points"
-        other = wording.short_name(claim.than)
+        points = f"{wording.format_number(claim.points)} points"
+        other = wording.shorten_name(claim.than)
         return (
             f"{model} is right at most {points} less often than {other} "
             f"on the same pictures of {what}"
@@ -221,7 +221,7 @@ def describe_claim(claim: AnyClaim, config: SceneConfig) -> str:
     epsilon = getattr(config, "epsilon", None)
     budget = ""
     if isinstance(epsilon, float):
-        budget = f" within {wording.number_text(epsilon)}"
+        budget = f" within {wording.format_number(epsilon)}"
     elif epsilon is not None:
         budget = f" within {epsilon}"
     return f"no search finds a picture that {model} gets wrong: {what}{budget}"
@@ -249,12 +249,12 @@ def describe_fraction(
     """
     reason = "no picture"
     if pictures:
-        interval_text = wording.interval_text(interval)
+        interval_text = wording.format_interval(interval)
         reason = f"{claimed} in {right} of {pictures} (interval {interval_text})"
     if outcomes:
         reason += f"; {outcomes}"
     if verdict == UNDECIDED:
-        reason += f"; not decided after {wording.count(pictures, 'picture')}"
+        reason += f"; not decided after {wording.format_count(pictures, 'picture')}"
     if worst:
         reason += f"; {worst}"
     return reason
@@ -281,12 +281,12 @@ def describe_difference(
     bounds = " to ".join(f"{100.0 * bound:+.1f}" for bound in interval)
     points = 100.0 * (only_this - only_other) / pictures
     reason = (
-        f"of {wording.count(pictures, 'picture')} it alone is right in {only_this}, "
-        f"{wording.short_name(other_model)} alone in {only_other} "
+        f"of {wording.format_count(pictures, 'picture')} it alone is right in {only_this}, "
+        f"{wording.shorten_name(other_model)} alone in {only_other} "
         f"(difference {points:+.1f} points, interval {bounds})"
     )
     if verdict == UNDECIDED:
-        reason += f"; not decided after {wording.count(pictures, 'picture')}"
+        reason += f"; not decided after {wording.format_count(pictures, 'picture')}"
     return reason
 
 
@@ -301,13 +301,13 @@ def evaluate_search(
         return FAILED, _clean_reason(summary), None
     if summary.ending == "found" and verified is not None:
         prediction = describe_wrong_prediction(summary.task, verified)
-        interval = wording.interval_text(verified.interval)
+        interval = wording.format_interval(verified.interval)
         wrong = (
             f"wrong in {verified.successes} of {verified.trials} trials (interval "
             f"{interval})"
         )
         return FAILED, f"a verified counterexample: {wrong}{prediction}", None
-    if summary.goes_on:
+    if summary.is_unfinished:
         return UNDECIDED, INTERRUPTED_REASON, Cause.INTERRUPTED
     if verified is not None and verified.successes:
         reason = (
@@ -321,7 +321,7 @@ def evaluate_search(
         reason = f"{OUT_OF_TIME_REASON} after {summary.steps} of {max_steps} steps"
         return UNDECIDED, reason, Cause.OUT_OF_TIME
     baseline = "" if summary.baseline is None else ", nor by as many random renders"
-    steps = wording.count(summary.steps, "step")
+    steps = wording.format_count(summary.steps, "step")
     reason = f"not broken by {steps} of {summary.policy}{baseline}; this is no proof"
     return HELD, reason, None
 
@@ -333,7 +333,7 @@ def _clean_reason(summary: workbench.AttackSummary) -> str:
     if clean is not None:
         reason += f": right in {clean.correct} of {clean.trials} trials"
         if clean.outcomes:
-            reason += f", {wording.outcomes_text(clean.outcomes, summary.task)}"
+            reason += f", {wording.format_outcomes(clean.outcomes, summary.task)}"
     return reason
 
 
@@ -341,8 +341,8 @@ def describe_wrong_prediction(task: str, verified: results.VerifiedRate) -> str:
     """Return the most frequent wrong prediction, as the end of a sentence."""
     label = next(iter(verified.labels), "")
     if verified.outcomes:
-        return f": {wording.outcomes_text(verified.outcomes, task)}"
-    return f", most often {wording.with_article(label)}" if label else ""
+        return f": {wording.format_outcomes(verified.outcomes, task)}"
+    return f", most often {wording.add_article(label)}" if label else ""
 
 
 def describe_unsuitable(error: str) -> str:
@@ -382,15 +382,15 @@ def describe_trials(
             "nothing of the object is to be seen" if uncounted else OUT_OF_TIME_REASON
         )
     if not wrong:
-        interval_text = wording.interval_text(interval)
+        interval_text = wording.format_interval(interval)
         reason = f"right in {right} of {right} {trials} (interval {interval_text})"
     else:
         lower, upper = interval
-        interval_text = wording.interval_text((1.0 - upper, 1.0 - lower))
+        interval_text = wording.format_interval((1.0 - upper, 1.0 - lower))
         reason = (
             f"wrong in {wrong} of {right + wrong} {trials} (interval {interval_text})"
         )
-        reason += f": {outcomes}" if outcomes else f", {wording.with_article(label)}"
+        reason += f": {outcomes}" if outcomes else f", {wording.add_article(label)}"
     if verdict == UNDECIDED and right and wrong:
         cause = "conditions" if over else "noise"
         reason += f": it depends on the {cause}"
@@ -438,7 +438,7 @@ def list_facts(result: SuiteResult) -> dict[str, str]:
         "pictures decide",
         "pictures": str(sum(claim.pictures for claim in result.claims)),
         "seed": str(result.seed),
-        "time": wording.seconds_text(result.seconds["total"]),
+        "time": wording.format_seconds(result.seconds["total"]),
     }
 
 
@@ -565,7 +565,7 @@ def format_sarif(result: SuiteResult) -> str:
     ]
     driver = {"name": "advsearch", "version": __version__, "rules": rules}
     invocation = {
-        "executionSuccessful": not result.goes_on,
+        "executionSuccessful": not result.is_unfinished,
         "commandLine": result.command_line or "",
     }
     run = {

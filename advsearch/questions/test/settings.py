@@ -55,11 +55,11 @@ class SuiteConfig(Config):
         None, "test", "keep the adversarial scene of this run as a counterexample "
                       "beside the suite, and try it",
         "the name or the folder of a run of attack", otherwise="nothing is added",
-        power=powers.beside_suite,
+        power=powers.describe_suite_change,
     )
     update: bool = setting(
         False, "test", "expect from now on what the claims say today, and show what "
-                       "changes", power=powers.beside_suite
+                       "changes", power=powers.describe_suite_change
     )
     all: bool = setting(False, "test", "go on with the other claims where a "
                                        "counterexample fails")
@@ -75,15 +75,15 @@ class SuiteConfig(Config):
     )
     junit: str | None = setting(
         None, "files", "write JUnit XML, a test case for each claim", "a file",
-        otherwise="none", power=powers.file,
+        otherwise="none", power=powers.describe_file,
     )
     sarif: str | None = setting(
         None, "files", "write SARIF 2.1.0, a result for each claim that is not held", "a file",
-        otherwise="none", power=powers.file,
+        otherwise="none", power=powers.describe_file,
     )
     markdown: str | None = setting(
         None, "files", "write a Markdown table, for the summary of a job", "a file",
-        otherwise="none", power=powers.file,
+        otherwise="none", power=powers.describe_file,
     )
     seed: int | None = setting_as_in(
         SceneConfig, "seed", default=None, otherwise="what the suite says, or 0"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from advsearch.extend import errors, reading, stored_files
 
-LONGEST = 120  # timeout of Blender in seconds, before `scaled`
+LONGEST = 120  # timeout of Blender in seconds, before `scale_limit`
 MAGIC_BYTES = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
 """First bytes of a .blend file: uncompressed, zstd, or gzip (before Blender 3.0)."""
 EXPORT_SCRIPT = """
@@ -56,7 +56,7 @@ def convert_blend(path: Path, data: bytes) -> bytes:
         arguments = [
             str(path.resolve()),
             str(target),
-            str(stored_files.scaled(stored_files.LARGEST_FILE)),
+            str(stored_files.scale_limit(stored_files.LARGEST_FILE)),
         ]
         # The bpy package runs in Python (-I), which needs no separator.
         separator = [] if "-I" in program else ["--"]
@@ -68,7 +68,7 @@ def convert_blend(path: Path, data: bytes) -> bytes:
                 command,
                 folder=folder,
                 seconds=LONGEST,
-                env=reading.surroundings(folder),
+                env=reading.make_environment(folder),
             )
         except OSError as error:
             raise errors.FileFormatError(

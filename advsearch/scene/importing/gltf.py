@@ -27,7 +27,7 @@ from advsearch.scene.importing.files import (
     format_name,
 )
 from advsearch.scene.importing.gltf_entries import Asset, Entry, Header, Primitive
-from advsearch.trust.named_files import References, plain_name
+from advsearch.trust.named_files import References, normalize_name
 from advsearch.trust.stored_files import JsonBoundsError, check_most, parse_json
 
 MOST_VALUES = 1_000_000
@@ -431,7 +431,7 @@ class GltfFile:
             else:
                 raise self._make_empty_buffer_error(index)
         except FileNotFoundError:
-            name = plain_name(uri or "")
+            name = normalize_name(uri or "")
             reason = self.references.refused.get(name, "is missing")
             message = (
                 f"{self.path}: needs {format_name(name)}, which {reason}; put "

@@ -22,7 +22,7 @@ import numpy.typing as npt
 import OpenEXR
 
 from advsearch.errors import AdvsearchError, FileFormatError
-from advsearch.pictures import LARGEST_PIXELS, check_pixels
+from advsearch.pictures import MAX_PIXELS, check_pixels
 from advsearch.scene.assets import Float32Array
 from advsearch.scene.importing.files import damaged, describe_content, format_name
 from advsearch.trust.stored_files import check_most
@@ -30,7 +30,7 @@ from advsearch.trust.stored_files import check_most
 Plane = npt.NDArray[np.floating]
 Planes = tuple[Plane, Plane, Plane]
 # Limit of the pixels times channels of a file (8192 x 4096 with 4), before `scaled`.
-MAX_VALUES = 2 * LARGEST_PIXELS
+MAX_VALUES = 2 * MAX_PIXELS
 CHANNEL_NAMES = {
     "r": "R",
     "red": "R",

@@ -25,7 +25,7 @@ from advsearch.scene.importing.parts import (
 from advsearch.scene.importing.pictures import FileImages, ImageKind
 from advsearch.scene.importing.texture import average_over_faces
 from advsearch.scene.importing.unread import TrackedKeys
-from advsearch.trust.named_files import References, plain_name
+from advsearch.trust.named_files import References, normalize_name
 
 IGNORED_KEYWORDS = frozenset("ka ks ns ni sharpness map_aat".split())
 """Common statements that a physical material cannot have: ambient light, Phong's
@@ -80,7 +80,7 @@ class MtlReader:
         try:
             text = decode_text(self.references.get(name))
         except FileNotFoundError:
-            file_name = plain_name(name)
+            file_name = normalize_name(name)
             reason = (
                 f"{format_name(file_name)}, which {self.references.refused[file_name]}"
             )
@@ -89,7 +89,7 @@ class MtlReader:
             )
             return
         self.n_libraries += 1
-        file = plain_name(name).rpartition("/")[2]
+        file = normalize_name(name).rpartition("/")[2]
         materials, stray_keywords = parse_mtl(text, file)
         for keyword in stray_keywords:
             self.notes.record(
@@ -157,7 +157,7 @@ class MtlReader:
         if not others:
             return []
         exists = (
-            isinstance(self.references.tried(replace_square(numbered, square)), bytes)
+            isinstance(self.references.find(replace_square(numbered, square)), bytes)
             for square in others
         )
         if find_square(numbered) == 0 or any(exists):
@@ -316,7 +316,7 @@ class MtlReader:
         use = parse_map(without_comment(rest))
         with_comment = parse_map(rest)
         if with_comment is not None and with_comment != use:
-            if isinstance(self.references.tried(with_comment.name), bytes):
+            if isinstance(self.references.find(with_comment.name), bytes):
                 use = with_comment  # the # belongs to the name
         self._uses[id(material), key] = use
         has_colors = key in ("map_kd", "map_ke")
@@ -534,7 +534,7 @@ def find_libraries(arguments: Sequence[str], references: References) -> list[str
 
 
 def _exists(references: References, name: str) -> bool:
-    return isinstance(references.tried(name), bytes)
+    return isinstance(references.find(name), bytes)
 
 
 def _has_mtl_suffix(name: str) -> bool:

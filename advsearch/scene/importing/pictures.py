@@ -17,16 +17,16 @@ from scipy import sparse
 from advsearch.errors import FileFormatError
 from advsearch.pictures import (
     FORMATS,
-    LARGEST_PIXELS,
+    MAX_PIXELS,
     check_decodable,
     check_pixels,
-    opened,
-    steps_of,
+    open_image,
+    to_8bit_levels,
 )
 from advsearch.scene.assets import Float32Array
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import Notes, format_name
-from advsearch.trust.named_files import References, plain_name
+from advsearch.trust.named_files import References, normalize_name
 from advsearch.trust.stored_files import LARGEST_FILE, check_most
 
 # Limit of the sides of an imported texture, in texels; larger ones are averaged down.
@@ -43,7 +43,7 @@ def read_image(
         FileFormatError: the file is missing, no ordinary file, no image, too large or
             corrupt.
     """
-    with opened(path, LARGEST_FILE) as image:
+    with open_image(path, LARGEST_FILE) as image:
         return load_display_image(image, limit, path, is_raw=is_raw)
 
 
@@ -83,14 +83,14 @@ def load_display_image(
         # Value of each of the 256 levels.
         display: Float32Array = np.arange(256, dtype=np.float32) / np.float32(255.0)
         if scale >= 1.0:
-            return np.asarray(display[steps_of(image, alpha=keep_alpha)])
+            return np.asarray(display[to_8bit_levels(image, alpha=keep_alpha)])
         target = max(1, round(height * scale)), max(1, round(width * scale))
         linear = display if is_raw else srgb_to_linear(display)
         is_weighted = not is_raw and (keep_alpha or image.has_transparency_data)
 
         def load_band(top: int, end: int) -> Float32Array:
             band_image = image.crop((0, top, width, end))
-            levels = steps_of(band_image, alpha=is_weighted)
+            levels = to_8bit_levels(band_image, alpha=is_weighted)
             colors = linear[levels[:, :, :3]]
             if not is_weighted:
                 return colors
@@ -192,7 +192,7 @@ def _compute_overlaps(source: int, target: int) -> sparse.csr_array:
 
 
 ImageKind = Literal["colours", "colours and alpha", "numbers"]  # what a picture holds
-LARGEST_SUM = 2 * LARGEST_PIXELS
+LARGEST_SUM = 2 * MAX_PIXELS
 """Limit of the pixels of all color textures of a file, and of those of numbers; before
 `scaled`.
 """
@@ -278,7 +278,7 @@ class FileImages:
         try:
             image = Image.open(io.BytesIO(content()), formats=FORMATS)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-            return self.references.refused.get(plain_name(name), UNREADABLE)
+            return self.references.refused.get(normalize_name(name), UNREADABLE)
         (width, height) = image.size
         is_raw = kind == "numbers"
         n_pixels = self._pixels[is_raw] + width * height

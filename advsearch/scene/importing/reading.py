@@ -28,13 +28,13 @@ from advsearch.scene.importing.parts import ImportedPart as ImportedPart
 from advsearch.scene.importing.parts import has_normals as has_normals
 from advsearch.scene.importing.unread import TrackedKeys as TrackedKeys
 from advsearch.scene.importing.unread import join_names as join_names
-from advsearch.trust.code import OWN_FOLDER as OWN_FOLDER
+from advsearch.trust.code import SUBPROCESS_DIRECTORY as SUBPROCESS_DIRECTORY
 from advsearch.trust.named_files import MISSING as MISSING
 from advsearch.trust.named_files import OUTSIDE as OUTSIDE
 from advsearch.trust.named_files import is_inside as is_inside
 from advsearch.trust.programs import find_blender as find_blender
+from advsearch.trust.programs import make_environment as make_environment
 from advsearch.trust.programs import run_converter as run_converter
-from advsearch.trust.programs import surroundings as surroundings
 
 if TYPE_CHECKING:
     from advsearch.scene import backdrop as backdrop

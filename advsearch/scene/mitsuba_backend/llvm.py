@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError, EnvironmentSetupError
-from advsearch.trust.code import OWN_FOLDER
+from advsearch.trust.code import SUBPROCESS_DIRECTORY
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
 MIN_VERSION = 17  # the first major version that renders: see the head of this file
@@ -308,7 +308,7 @@ def query_version(library: str) -> Version:
             text=True,
             timeout=30,
             check=True,
-            cwd=OWN_FOLDER,
+            cwd=SUBPROCESS_DIRECTORY,
         ).stdout
         return tuple(int(number) for number in output.split())
     except (OSError, subprocess.SubprocessError, ValueError):

@@ -606,7 +606,7 @@ class _TangentSamples(NamedTuple):
     measure_per_sample: float  # world units times steradians
 
 
-def _turn_away(vectors: Tensor, directions: Tensor) -> Tensor:
+def _orient_outwards(vectors: Tensor, directions: Tensor) -> Tensor:
     """Return vectors (N, 3), turned over where they point in a direction (N, 3)."""
     points_inwards = (vectors * directions).sum(dim=1, keepdim=True) > 0.0
     return vectors * torch.where(points_inwards, -1.0, 1.0)
@@ -645,7 +645,7 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
     height = height.abs() - 1.0
     direction = height * axis + (1.0 - height.square()).clamp_min(0.0).sqrt() * aside
 
-    normal = _turn_away(torch.linalg.cross(axis, aside), first + second)
+    normal = _orient_outwards(torch.linalg.cross(axis, aside), first + second)
     return _TangentSamples(
         ends=edges.ends[pick],
         fraction=random[:, 1],

@@ -45,7 +45,7 @@ from advsearch.scene.mitsuba_backend.variant import (
     suppress_warnings,
 )
 from advsearch.trust.named_files import References, is_inside
-from advsearch.trust.stored_files import note_opened, scaled, too_large
+from advsearch.trust.stored_files import make_size_error, record_opened, scale_limit
 
 SUFFIX = ".xml"
 MAX_BYTES = 1 << 24  # bytes of a file, and of all that it includes
@@ -122,10 +122,10 @@ class _SceneText:
         Comments and blanks are included, so that lines stay the same.
         """
         self.size += len(data)
-        if self.size > scaled(MAX_BYTES):
-            raise too_large(
+        if self.size > scale_limit(MAX_BYTES):
+            raise make_size_error(
                 self.path,
-                f"a scene of at most {scaled(MAX_BYTES):,} bytes",
+                f"a scene of at most {scale_limit(MAX_BYTES):,} bytes",
                 f"{self.size:,}",
             )
         parser = expat.ParserCreate()
@@ -173,8 +173,8 @@ class _SceneText:
                 self.lines_before = parser.CurrentLineNumber - 1
             depth += 1
             self.elements += 1
-            if self.elements > scaled(MAX_ELEMENTS) or depth > MAX_NESTING:
-                limit = f"at most {scaled(MAX_ELEMENTS):,} elements, {MAX_NESTING} deep"
+            if self.elements > scale_limit(MAX_ELEMENTS) or depth > MAX_NESTING:
+                limit = f"at most {scale_limit(MAX_ELEMENTS):,} elements, {MAX_NESTING} deep"
                 raise FileFormatError(
                     f"{self.path}: expected {limit}, got more; split the scene up"
                 )
@@ -475,7 +475,7 @@ class _FileReader:
         for candidate in (str(name), os.path.basename(str(name))):
             file = Path(os.path.realpath(os.path.join(directory, candidate)))
             if file.is_file() and is_inside(file, directory):
-                note_opened(file)
+                record_opened(file)
                 return file
         raise FileFormatError(
             f"{self._path}: {kind} needs {format_name(str(name))}; write its "

@@ -24,7 +24,7 @@ from advsearch.scene.places.place_file import (
     resolve_sibling_path,
     split_light,
 )
-from advsearch.trust.stored_files import reading
+from advsearch.trust.stored_files import track_opened_files
 
 
 def import_place(spec: str) -> EnvironmentAsset:
@@ -38,7 +38,7 @@ def import_place(spec: str) -> EnvironmentAsset:
     """
     name, requested_light = split_light(spec)
     path = Path(name)
-    with reading(path):
+    with track_opened_files(path):
         file = read_place_file(path)
         light_name = (
             next(iter(file.lights)) if requested_light is None else requested_light

@@ -34,8 +34,12 @@ from advsearch.scene.parts import MeshPart, Place
 from advsearch.scene.places.place_meshes import read_place_meshes
 from advsearch.scene.places.schema import PlaceFile
 from advsearch.trust.named_files import OUTSIDE, is_inside
-from advsearch.trust.stored_files import parsed, present_text, reading
-from advsearch.trust.yaml_text import LARGEST, parse_yaml
+from advsearch.trust.stored_files import (
+    parse_text,
+    read_existing_text,
+    track_opened_files,
+)
+from advsearch.trust.yaml_text import MAX_YAML_BYTES, parse_yaml
 
 SUFFIXES = (".yaml", ".yml")
 DEFAULT_LUMINANCE = 1000.0  # cd/m2 of a radiance of 1 where the light has no unit
@@ -68,9 +72,9 @@ def read_place_file(path: Path) -> PlaceFile:
 
     Raises FileFormatError: it is missing, is not YAML, or says something else.
     """
-    content = parsed(
+    content = parse_text(
         path,
-        present_text(path, "the YAML file of a place", LARGEST),
+        read_existing_text(path, "the YAML file of a place", MAX_YAML_BYTES),
         "YAML",
         parse_yaml,
     )
@@ -146,7 +150,7 @@ def load_bundled_place(name: str, variant: str | None = None) -> Place:
         resources.files("advsearch.bundled") / "data" / "places" / name
     ) as directory:
         path = directory / "place.yaml"
-        with reading(path):
+        with track_opened_files(path):
             return read_place(path, read_place_file(path), variant)
 
 

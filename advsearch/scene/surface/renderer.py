@@ -34,7 +34,7 @@ from advsearch.scene.surface.arrangement import (
     ArrangementLight,
     SurfaceView,
 )
-from advsearch.trust.stored_files import scaled
+from advsearch.trust.stored_files import scale_limit
 
 MAX_RAYS = 1 << 21  # rays of cameras of one launch
 N_COMPARED_TEXELS = (
@@ -192,7 +192,7 @@ class SurfaceRenderer(Predictor):
                 return light, factor
         light = self.compute_light(inputs)
         self.stored_lights[sketch] = light
-        while len(self.stored_lights) > 1 and self.n_bytes > scaled(MAX_BYTES):
+        while len(self.stored_lights) > 1 and self.n_bytes > scale_limit(MAX_BYTES):
             oldest = next(iter(self.stored_lights))
             self.stored_lights.pop(oldest)
             self.n_dropped += 1

@@ -40,7 +40,7 @@ from advsearch.scene.mitsuba_backend.transport import Paths, Vertices, average_p
 from advsearch.scene.parts import PATTERN_SUFFIX
 from advsearch.scene.predictor import MAX_BYTES, LinearMap, Predictor
 from advsearch.scene.renderer import InputSpace, Renderer
-from advsearch.trust.stored_files import scaled
+from advsearch.trust.stored_files import scale_limit
 
 # from a noisy image (H, W, 3) to one without noise
 Smooth = Callable[[Tensor], Tensor]
@@ -577,9 +577,9 @@ def _fill_transports(
             paths = renderer.scene.collect_paths(traced, name, noise_seed, samples)
             transport.add_pass(paths.vertices, 1.0 / n_passes)
             size = sum(filled.bytes for filled in transports.values())
-            if size + 8 * height * width > scaled(MAX_BYTES):
+            if size + 8 * height * width > scale_limit(MAX_BYTES):
                 raise TransportTooLargeError(
-                    f"{TOO_LARGE} {scaled(MAX_BYTES) / 2**30:g} GiB"
+                    f"{TOO_LARGE} {scale_limit(MAX_BYTES) / 2**30:g} GiB"
                 )
             images.append(replace(paths, vertices=[]))
             tick(samples)

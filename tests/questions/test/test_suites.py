@@ -55,7 +55,7 @@ from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.result import ClaimResult, SuiteResult
 from advsearch.questions.test.settings import NoWorseClaim, SuiteConfig, parse_suite
 from advsearch.registry import get_experiment
-from advsearch.runs.listing import listed_run
+from advsearch.runs.listing import read_listed_run
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.scene.color import linear_to_srgb
@@ -134,7 +134,7 @@ def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tu
     assert picture == str(folder / "run") and (folder / "run" / str(found["behind"].picture)).is_file()
     assert "camera.azimuth 2" in found["behind"].reason, "where it is most wrong, in words"
     with Store(folder / "run" / "results.sqlite", read_only=True) as store:
-        counts = store.counts()
+        counts = store.count_by_kind()
     assert counts["claim in-front"] == found["in-front"].pictures and counts["claim too-few"] == 9
     assert counts["claim no-worse"] == counts["claim no-worse beside"] == found["no-worse"].pictures
     assert read_result(folder / "run") == result
@@ -271,10 +271,10 @@ def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictur
 
     monkeypatch.setattr(Problem, "judge", stopped)
     first = carry_out(config)
-    assert first.goes_on and {one.reason for one in first.claims} == {"it was interrupted"}
+    assert first.is_unfinished and {one.reason for one in first.claims} == {"it was interrupted"}
     done, last = 0, front + 4  # in the middle of `no-worse`
     again = carry_out(config, resumed=tmp_path / "run")
-    assert again.goes_on and [one.answer for one in again.claims] == ["held", "undecided", "undecided"]
+    assert again.is_unfinished and [one.answer for one in again.claims] == ["held", "undecided", "undecided"]
     done, last = 0, -1
     ended = carry_out(config, resumed=tmp_path / "run")
     assert {one.name: (one.answer, one.reason, one.interval) for one in ended.claims} == whole
@@ -312,7 +312,7 @@ def test_a_model_that_is_broken_on_purpose_fails_where_its_like_holds_with_the_p
 def test_what_the_time_is_over_for_is_undecided_and_can_go_on(tmp_path: Path) -> None:
     config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="behind,in-front", seconds=1e-3, run=str(tmp_path / "r"))
     result = carry_out(config)
-    assert (result.status, result.ending, result.goes_on) == (2, "out of time", True)
+    assert (result.status, result.ending, result.is_unfinished) == (2, "out of time", True)
     assert all("the time of the suite was over before it began" == one.reason for one in result.claims)
     assert carry_out(config.model_copy(update={"seconds": None}), resumed=tmp_path / "r").brief == "1 held, 1 failed"
 
@@ -472,7 +472,7 @@ def test_a_configuration_over_conditions_is_kept_where_it_holds_in_most_of_them(
     assert added.added and one.answer == "failed" and one.interval is not None and one.interval[1] <= 0.5
     assert "conditions in which the clean scene is right" in one.reason and 0.0 < (one.rate or 0.0) < 0.3
     with Store(tmp_path / "added" / "results.sqlite", read_only=True) as store:
-        counts = store.counts()
+        counts = store.count_by_kind()
     assert counts["added counterexample over"] == counts["added counterexample over, clean"] == one.pictures
 
 
@@ -808,7 +808,7 @@ def test_a_suite_at_work_is_running(tmp_path: Path, capsys: pytest.CaptureFixtur
     class Watching(NullProgress):
         def message(self, text: str) -> None:
             if text.startswith("no-worse:"):  # the summary of the first claim is there, which a kill would leave
-                said.extend([listed_run(tmp_path / "run").state, make_progress_page("run", tmp_path / "run")])
+                said.extend([read_listed_run(tmp_path / "run").state, make_progress_page("run", tmp_path / "run")])
                 assert main(["show", str(tmp_path / "run")]) == 0
                 said.append(capsys.readouterr().out)
 

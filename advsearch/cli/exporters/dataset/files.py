@@ -99,7 +99,7 @@ def write_dataset(
     writing.check_free_folder(out, "out")
     directory.find_run(run)  # refuses before anything is written
     categories = Categories()
-    with writing.placed_by("out"):
+    with writing.name_setting_in_errors("out"):
         with writing.storage_errors(out):
             out.parent.mkdir(parents=True, exist_ok=True)
             temporary = tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent)

@@ -58,7 +58,7 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
             "nothing to project"
         )
     notes: list[str] = []
-    with writing.placed_by("out"), writing.storage_errors(out):
+    with writing.name_setting_in_errors("out"), writing.storage_errors(out):
         for control, u in projectors:
             folder = out / control.file_name if len(projectors) > 1 else out
             folder.mkdir(parents=True)

@@ -60,7 +60,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
         *describe_formation(renderer, gain, backdrop),
         *describe_omissions(adversarial, hazy=hazy),
     ]
-    with writing.placed_by("out"), writing.storage_errors(path):
+    with writing.name_setting_in_errors("out"), writing.storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as folder:
             mitsuba_data.write_scene(
@@ -166,7 +166,7 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
             found,
             mesh=replace(found.mesh, vertices=found.mesh.vertices * np.float32(metres)),
         )
-    with writing.placed_by("out"):
+    with writing.name_setting_in_errors("out"):
         writing.write_bytes(out, reading.encode_glb([found]))
     unit = "object sizes" if metres is None else "metres"
     notes = [f"Lengths are in {unit}, y is up, and the texture is rounded to 8 bits."]

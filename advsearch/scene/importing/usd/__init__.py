@@ -16,8 +16,8 @@ from advsearch.extend import errors, reading, stored_files
 
 PACKAGE_SUFFIX = ".usdz"
 LAYER_SUFFIXES = (".usd", ".usda", ".usdc")
-USD_TIMEOUT_S = 120  # timeout in seconds, before `scaled`
-MAX_MEMORY = 8 << 30  # limit of its memory in bytes, before `scaled`
+USD_TIMEOUT_S = 120  # timeout in seconds, before `scale_limit`
+MAX_MEMORY = 8 << 30  # limit of its memory in bytes, before `scale_limit`
 USD_MAGIC_BYTES = (b"PXR-USDC", b"#usda", b"PK\x03\x04")
 REJECTED_PREFIX = "refused: "
 _LIMITED_SCRIPT = f"""
@@ -59,7 +59,7 @@ def convert_usd(path: Path, data: bytes) -> bytes:
         package_folder = Path(folder) / "package"
         package_folder.mkdir()
         arguments = [
-            str(stored_files.scaled(MAX_MEMORY)),
+            str(stored_files.scale_limit(MAX_MEMORY)),
             str(path.resolve()),
             str(target),
             str(package_folder),
@@ -69,14 +69,14 @@ def convert_usd(path: Path, data: bytes) -> bytes:
             path,
             "usd-core",
             program,
-            folder=reading.OWN_FOLDER,
+            folder=reading.SUBPROCESS_DIRECTORY,
             seconds=USD_TIMEOUT_S,
             env=None,
         )
         if process.returncode or not target.is_file():
             raise _conversion_error(path, process.stderr, process.returncode)
         for name in json.loads(process.stdout.splitlines()[-1]):
-            stored_files.note_opened(name)
+            stored_files.record_opened(name)
         return stored_files.read_bytes(
             target, "a glTF file", 4 * stored_files.LARGEST_FILE
         )

@@ -73,8 +73,8 @@ def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
     entries = archive.infolist()
     size = sum(entry.file_size for entry in entries)
     got = f"{len(entries):,} of {size:,}"
-    max_files = stored_files.scaled(MAX_ENTRIES)
-    max_bytes = stored_files.scaled(stored_files.LARGEST_FILE)
+    max_files = stored_files.scale_limit(MAX_ENTRIES)
+    max_bytes = stored_files.scale_limit(stored_files.LARGEST_FILE)
     expected = f"at most {max_files:,} files of {max_bytes:,} bytes in all"
     stored_files.check_most(name, len(entries), MAX_ENTRIES, expected, got)
     stored_files.check_most(name, size, stored_files.LARGEST_FILE, expected, got)
@@ -187,7 +187,7 @@ class _LayerCheck:
         """Count a layer of a size in bytes against the limits."""
         self._count += 1
         self._size += size
-        expected = f"at most {stored_files.scaled(MAX_LAYERS):,} layers"
+        expected = f"at most {stored_files.scale_limit(MAX_LAYERS):,} layers"
         got = "more, or larger ones"
         stored_files.check_most(self.file.name, self._count, MAX_LAYERS, expected, got)
         stored_files.check_most(
