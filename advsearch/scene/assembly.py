@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.assets import Float32Array, IntArray, Mesh, Shape
+from advsearch.scene.backdrop import compute_plane_radiance
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import (
@@ -35,7 +36,7 @@ from advsearch.scene.gradients import Group
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart
 
 # inputs that the renderer applies to radiance
-IMAGE_INPUTS = frozenset({"backdrop.color", "camera.exposure"})
+IMAGE_INPUTS = frozenset({"backdrop.color", "backdrop.plane", "camera.exposure"})
 
 
 class MovingMesh:
@@ -177,8 +178,10 @@ class Assembly:
         ]
         self._photograph = description.photograph
         self._backdrop: Tensor | None = None
+        self._plane_radiance: Tensor | None = None
         if description.backdrop_photograph is not None and resolution is not None:
             self._backdrop = description.backdrop_photograph.resample(resolution)
+            self._plane_radiance = compute_plane_radiance(description)
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps applied.
@@ -193,6 +196,8 @@ class Assembly:
         parameters = dict(inputs)
         if self._backdrop is not None:
             parameters["backdrop.color"] = self._backdrop
+        if self._plane_radiance is not None:
+            parameters["backdrop.plane"] = self._plane_radiance
         for part in self._carried:  # what carries it may be moved or deformed
             parameters |= _move_carried(part, inputs)
         for name, mesh in self.meshes.items():

@@ -1,6 +1,15 @@
 """Photographs that a scene is rendered into, and the camera that took them.
 
-    display-linear = coverage * rendered + (1 - coverage) * photograph
+    display-linear = rendered + shade * photograph
+    shade = 1 - coverage + change of the plane's radiance / its radiance
+
+`rendered` is the object's light times its coverage. The plane is a matt ground below
+the object that is itself not seen: what the object takes from its light, and adds,
+scales the photograph (Debevec 1998, Rendering synthetic objects into real scenes,
+section 5, adds the difference instead). Light that a matt surface reflects is its
+albedo times what arrives, so that the ratio is right whatever the albedo of the ground
+at that pixel is, and it never goes below zero; a difference is right only where the
+albedo of the plane is that of the ground, and makes dark ground negative.
 
 The photograph is read as a viewer shows it, decoded from sRGB, and averaged over the
 area of each pixel of the film. A part of it may be cut out, `photo.jpg#X,Y,WIDTH,HEIGHT`
@@ -35,7 +44,8 @@ from advsearch.scene.camera_model import (
     make_bundled_models,
     make_pinhole,
 )
-from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.color import CHANNELS, linear_to_srgb, srgb_to_linear
+from advsearch.scene.geometry import camera_to_world, object_to_world, project_points
 from advsearch.scene.importing.pictures import average_area
 from advsearch.trust.stored_files import LARGEST_FILE, reading
 
@@ -49,6 +59,19 @@ ROTATION_TOLERANCE = 1e-3
 # largest relative difference between the shapes of a photograph and of its camera
 SHAPE_TOLERANCE = 0.01
 PHOTOGRAPH_CAMERA = "photograph"  # name of the pinhole of a part of a photograph
+# settings of the plane that takes the shadow
+PLANE_SETTINGS = frozenset(
+    ("ground.size", "ground.level", *(f"ground.{channel}" for channel in CHANNELS))
+)
+PLANE_SIZE = 12.0  # side of the plane, object sizes
+# mean reflectance of what photographs show (Buchsbaum 1980, A spatial processor model
+# for object colour perception), which gives the exposure, and the plane its albedo
+GREY_WORLD = 0.3
+ALBEDO_RANGE = (0.05, 0.8)  # of the plane
+# radii around the object, in object sizes, between which the plane's color is measured
+CONTACT_RING = (0.5, 1.5)
+N_CONTACT_POINTS = 400
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue (BT.709)
 CROP = re.compile(r"(?P<path>.+)#(?P<numbers>\d+,\d+,\d+,\d+)")
 
 
@@ -180,6 +203,125 @@ def make_backdrop(
     return BackdropPhotograph(spec, levels, digest, crop or (0, 0, width, height))
 
 
+# ---- The light of a photograph
+
+
+def compute_photograph_gain(
+    description: SceneDescription, photograph: BackdropPhotograph
+) -> float:
+    """Return the factor from radiance to display-linear values of a photograph.
+
+    A level surface with the mean reflectance of what photographs show is as bright as
+    the photograph is on average. 1 where no environment lights the scene.
+    """
+    irradiance = float(compute_level_irradiance(description) @ LUMINANCE)
+    if not irradiance > 0.0:
+        return 1.0
+    counts = [
+        np.bincount(photograph.levels[..., channel].reshape(-1), minlength=256)
+        for channel in range(len(CHANNELS))
+    ]
+    decoded = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
+    means = np.array([np.average(decoded, weights=count) for count in counts])
+    mean = max(float(means @ LUMINANCE), 1e-3)
+    return mean * math.pi / (GREY_WORLD * irradiance)
+
+
+def compute_level_irradiance(description: SceneDescription) -> Float64Array:
+    """Return the irradiance (3,) of a level surface under the environment alone.
+
+    It is that of the map, before `environment.exposure`.
+    """
+    environment = description.environment
+    if environment is None:
+        return np.zeros(len(CHANNELS))
+    rows = environment.radiance.shape[0]
+    edges = np.cos(np.arange(rows + 1) * math.pi / rows)
+    # of each row the integral of cosine and solid angle, where it lies above
+    upper = np.maximum(edges[:-1], 0.0)
+    lower = np.maximum(edges[1:], 0.0)
+    row_means = environment.radiance.mean(axis=1, dtype=np.float64)
+    weights = math.pi * (upper**2 - lower**2)
+    # no BLAS, whose last bits depend on its threads
+    return np.asarray((weights[:, None] * row_means).sum(axis=0))
+
+
+def has_plane(description: SceneDescription) -> bool:
+    """Return whether a scene has a plane that takes the shadow in a photograph.
+
+    It needs an environment, whose light the shadow is in, and a camera above it.
+    """
+    return (
+        description.backdrop_photograph is not None
+        and description.number("ground.size") > 0.0
+        and bool((compute_level_irradiance(description) > 0.0).all())
+        and camera_to_world(description)[2, 3] > description.number("ground.level")
+    )
+
+
+def compute_plane_radiance(description: SceneDescription) -> Tensor | None:
+    """Return the radiance (3,) float32 of the plane without the object.
+
+    None if a scene has no plane.
+    """
+    if not has_plane(description):
+        return None
+    srgb = np.array(description.ground_color, np.float32)
+    albedo = srgb_to_linear(srgb).astype(np.float64)
+    brightness = 2.0 ** description.number("environment.exposure")
+    radiance = albedo * brightness * compute_level_irradiance(description) / math.pi
+    return torch.from_numpy(radiance).float()
+
+
+def measure_plane_color(
+    description: SceneDescription, photograph: BackdropPhotograph
+) -> dict[str, float]:
+    """Return the settings of the plane's color, sRGB, measured around the object.
+
+    They follow from the median color of the photograph there and its light; empty if
+    the user stated a color, or none of it is in the photograph.
+
+    Args:
+        description: the scene, with the camera of the full photograph.
+        photograph: that it is rendered into.
+    """
+    names = [f"ground.{channel}" for channel in CHANNELS]
+    if not has_plane(description) or description.requested & set(names):
+        return {}
+    height, width = photograph.full_size
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0.0, 2.0 * math.pi, N_CONTACT_POINTS)
+    radius = rng.uniform(*CONTACT_RING, N_CONTACT_POINTS)
+    center = object_to_world(description)[:2, 3]
+    level = np.full(N_CONTACT_POINTS, description.number("ground.level"))
+    points = np.column_stack(
+        [
+            center[0] + radius * np.cos(angle),
+            center[1] + radius * np.sin(angle),
+            level,
+        ]
+    )
+    camera = camera_to_world(description, width / height)
+    relative = (points - camera[:3, 3]) @ camera[:3, :3]
+    positions, is_visible = project_points(
+        replace(description, aspect=width / height),
+        {},
+        torch.from_numpy(relative),
+        (height, width),
+    )
+    pixels = np.floor(positions.numpy() + np.array([width, height]) / 2.0).astype(int)
+    is_inside = is_visible.numpy() & (pixels >= 0).all(axis=1)
+    is_inside &= (pixels < np.array([width, height])).all(axis=1)
+    if not is_inside.any():
+        return {}
+    levels = photograph.levels[pixels[is_inside, 1], pixels[is_inside, 0]]
+    display = levels.astype(np.float32) / np.float32(255.0)
+    light = description.gain * compute_level_irradiance(description) / math.pi
+    albedo = np.median(srgb_to_linear(display), axis=0) / light
+    color = linear_to_srgb(np.clip(albedo, *ALBEDO_RANGE).astype(np.float32))
+    return dict(zip(names, map(float, color), strict=True))
+
+
 # ---- The camera of a photograph
 
 
@@ -244,13 +386,18 @@ def fit_to_photograph(
     if model is not None:
         model = make_bundled_models(full_aspect).get(model.name, model)
         _check_camera_shape(photograph, model)
+    uncropped = replace(description, camera_model=model)
+    plane_color = measure_plane_color(uncropped, photograph)
     if photograph.is_cropped:
         if model is None:
             fov = description.number("camera.fov")
             model = replace(make_pinhole(fov, full_aspect), name=PHOTOGRAPH_CAMERA)
         model = crop_camera(model, photograph)
     return replace(
-        description, aspect=resolution[1] / resolution[0], camera_model=model
+        description,
+        aspect=resolution[1] / resolution[0],
+        camera_model=model,
+        values={**description.values, **plane_color},
     )
 
 
@@ -339,7 +486,8 @@ def compute_view_settings(
 
     Returns:
         Values of ``camera.azimuth``, ``camera.elevation``, ``camera.roll``,
-        ``camera.distance`` and ``pose.*``, for `load_scene(settings=)`.
+        ``camera.distance``, ``pose.*`` and ``ground.level``, the height of the object's
+        lowest point, for `load_scene(settings=)`.
 
     Raises:
         InputError: the object comes from no file, or its size in metres is not known;
@@ -364,8 +512,9 @@ def compute_view_settings(
         **_decompose_rotation(rotation),
         "pose.x": float(offset[0]),
         "pose.y": float(offset[1]),
-        # from where its lowest vertex would be on the ground
+        # from where its lowest vertex would be at the height 0
         "pose.z": float(offset[2] + middle[2]) + lowest,
+        "ground.level": float(offset[2] + middle[2]) + lowest,
     }
 
 

@@ -16,6 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy.typing as npt
 import torch
 
 from advsearch.errors import InputError, UnknownNameError
@@ -29,7 +30,15 @@ from advsearch.scene.assets import (
     describe_size_doubts,
     with_size,
 )
-from advsearch.scene.backdrop import BackdropPhotograph, read_backdrop
+from advsearch.scene.backdrop import (
+    PLANE_SETTINGS,
+    PLANE_SIZE,
+    BackdropPhotograph,
+    compute_photograph_gain,
+    compute_view_settings,
+    make_matrix_camera,
+    read_backdrop,
+)
 from advsearch.scene.camera_entries import (
     MAX_TABLETOP_SIZE,
     PRESETS,
@@ -186,8 +195,8 @@ class SceneDescription:
     ) -> SceneDescription:
         """Return the scene as it is rendered into a photograph.
 
-        The camera of the scene is the one that took it. The photograph has a ground of
-        its own, and hides the environment, which keeps lighting the object.
+        The camera of the scene is the one that took it. It hides the environment, which
+        keeps lighting the object, and the ground is a plane that takes the shadow.
 
         Args:
             photograph: a picture file; with the part to use behind its name,
@@ -200,14 +209,16 @@ class SceneDescription:
         """
         if not isinstance(photograph, BackdropPhotograph):
             photograph = read_backdrop(photograph)
-        ground_settings = sorted(
-            name for name in self.requested if name.startswith("ground.")
+        others = sorted(
+            name
+            for name in self.requested - PLANE_SETTINGS
+            if name.startswith("ground.")
         )
-        if ground_settings:
+        if others:
             raise InputError(
-                f"`backdrop={photograph.spec}` and `set` {ground_settings[0]} contradict "
-                "each other: the photograph shows a ground of its own; leave one of "
-                "the two out"
+                f"`backdrop={photograph.spec}` and `set` {others[0]} contradict each "
+                "other: the ground of a photograph is a plane that takes the shadow, "
+                f"with {', '.join(sorted(PLANE_SETTINGS))}; leave one of the two out"
             )
         if self.rig:
             raise InputError(
@@ -220,8 +231,45 @@ class SceneDescription:
                 f"`backdrop={photograph.spec}` and `set` camera.drops contradict each "
                 "other: drops would show the photograph; leave one of the two out"
             )
-        scene = replace(self, backdrop=True, backdrop_photograph=photograph)
-        return scene.without_ground()
+        values = dict(self.values)
+        if "ground.size" not in self.requested:
+            values["ground.size"] = PLANE_SIZE
+        scene = replace(
+            self, backdrop=True, backdrop_photograph=photograph, values=values
+        )
+        return with_requested_ground(scene)
+
+    def with_measured_view(
+        self,
+        camera_matrix: npt.ArrayLike,
+        object_to_camera: npt.ArrayLike,
+        up: npt.ArrayLike | None = None,
+    ) -> SceneDescription:
+        """Return the scene as the camera of its photograph was measured to see it.
+
+        Args:
+            camera_matrix: intrinsics (3, 3) of the full photograph, in pixels, as
+                OpenCV has them.
+            object_to_camera, up: as for `backdrop.compute_view_settings`.
+
+        Raises:
+            InputError: it is rendered into no photograph; or as for
+                `backdrop.compute_view_settings`.
+        """
+        if self.backdrop_photograph is None:
+            raise InputError(
+                "camera_matrix: is that of a photograph, and there is none; give a "
+                "`backdrop`"
+            )
+        model = make_matrix_camera(camera_matrix, self.backdrop_photograph.full_size)
+        measured = compute_view_settings(self.object, object_to_camera, up)
+        return replace(
+            self,
+            camera=ORBIT_CAMERA,
+            camera_model=model,
+            values={**self.values, **measured},
+            requested=self.requested | set(measured),
+        )
 
     @staticmethod
     def load_object(spec: str | Path) -> ObjectAsset:
@@ -627,7 +675,9 @@ class SceneDescription:
         """
         stops = self.values.get("camera.ev")
         unit = None if self.environment is None else self.environment.candelas
-        if stops is None:
+        if stops is None and self.backdrop_photograph is not None:
+            exposure = compute_photograph_gain(self, self.backdrop_photograph)
+        elif stops is None:
             exposure = compute_metered_gain(self) if self.metered else 1.0
         elif unit is None:
             raise InputError(

@@ -279,7 +279,9 @@ def with_requested_ground(scene: SceneDescription) -> SceneDescription:
         for part in scene.parts
         if not (isinstance(part, MeshPart) and part.is_laid_ground)
     )
-    place = load_requested_place(scene)
+    place = None
+    if scene.backdrop_photograph is None:
+        place = load_requested_place(scene)
     if place is None:
         if len(others) == len(scene.parts):
             return scene

@@ -43,7 +43,7 @@ from advsearch.scene.gradients import (
     forbid_second_derivatives,
     make_first_plan,
 )
-from advsearch.scene.mitsuba_backend.denoise import denoise
+from advsearch.scene.mitsuba_backend.denoise import denoise_image
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.rig import Mount
 
@@ -55,7 +55,8 @@ Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
 Predict = Callable[[Mapping[str, Tensor]], Tensor]
 """From scene inputs to linear radiance (H, W, 3); differentiable.
 
-It is (H, W, 4) with coverage where there is a backdrop.
+It is (H, W, 4) with coverage where there is a backdrop, and (H, W, 7) with the change
+of the plane that takes the shadow in a photograph.
 """
 
 
@@ -304,8 +305,8 @@ class Renderer:
         mean = (halves[0] + halves[1]) / 2.0
         guide_seed = seeds.stream(self.root_seed, "guides", noise_seeds[0])
         albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
-        clean = denoise(mean[..., :3].contiguous(), albedo, normal)
-        return halves, torch.cat([clean, mean[..., 3:]], dim=-1)
+        plane_radiance = self.scene.plane_radiance if hide else None
+        return halves, denoise_image(mean, albedo, normal, plane_radiance)
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the inputs of Mitsuba's scene at a configuration (d,), without a
@@ -512,19 +513,19 @@ class Renderer:
 
     @torch.no_grad()
     def _compute_denoising_change(self, exposed: Tensor, guides: Tensor) -> Tensor:
-        """Return by how much a denoiser changes radiance (H, W, 3 or 4).
+        """Return by how much a denoiser changes an image (H, W, 3, 4 or 7).
 
         `guides` are albedo and normals (H, W, 6).
         """
-        noisy = exposed[..., :3].contiguous()
-        clean = denoise(
-            noisy,
+        has_plane = exposed.shape[-1] > 4
+        clean = denoise_image(
+            exposed,
             guides[..., :3].contiguous(),
             guides[..., 3:].contiguous(),
+            self.scene.plane_radiance if has_plane else None,
             quick=self.formation.quick,
         )
-        no_coverage = torch.zeros_like(exposed[..., 3:])
-        return torch.cat([clean - noisy, no_coverage], dim=-1)
+        return clean - exposed
 
     def finish_image(
         self,
@@ -537,7 +538,8 @@ class Renderer:
         """Return the image of rendered radiance.
 
         Args:
-            rendered: radiance (H, W, 3), or (H, W, 4) with coverage.
+            rendered: radiance (H, W, 3), or (H, W, 4) with coverage, or (H, W, 7) with
+                the change of the plane that takes the shadow.
             inputs: scene inputs, of which exposure and backdrop are applied.
             u: configuration, for what controls do to the finished image.
             display: if False, return the radiance that is to be displayed.
@@ -548,8 +550,11 @@ class Renderer:
         if exposure is not None:
             radiance = radiance * torch.exp2(exposure)
         if backdrop is not None:
-            uncovered = (1.0 - rendered[..., 3:]).clamp(0.0, 1.0)
-            radiance = radiance + uncovered * (backdrop / self.formation.gain)
+            shade = (1.0 - rendered[..., 3:4]).clamp(0.0, 1.0)
+            if "backdrop.plane" in inputs:
+                change = rendered[..., 4:] / inputs["backdrop.plane"]
+                shade = (shade + change).clamp_min(0.0)
+            radiance = radiance + shade * (backdrop / self.formation.gain)
         if not display:
             return radiance
         return self.space.apply_to_image(u, self.formation.display(radiance))
@@ -575,7 +580,8 @@ class Renderer:
             denoised: denoise it if the formation requires it.
 
         Returns:
-            (H, W, 3), or (H, W, 4) with coverage if the environment is hidden.
+            (H, W, 3), or (H, W, 4) with coverage if the environment is hidden, or (H,
+            W, 7) with the change of the plane that takes the shadow in a photograph.
         """
         if self._predict is not None:
             return self._predict(inputs)
@@ -743,13 +749,13 @@ class _Radiance(torch.autograd.Function):
             rendered, *guides = renderer.scene.render_images(inputs, image_seeds, spp)
         rendered = renderer.replace_non_finite(rendered)
         for guide in guides:
-            clean = denoise(
-                rendered[..., :3].contiguous(),
+            rendered = denoise_image(
+                rendered,
                 guide[..., :3],
                 guide[..., 3:],
+                renderer.scene.plane_radiance if hide else None,
                 quick=renderer.formation.quick,
             )
-            rendered = torch.cat([clean, rendered[..., 3:]], dim=-1) if hide else clean
         renderer.renders += 1
         return rendered
 
@@ -764,7 +770,7 @@ class _Radiance(torch.autograd.Function):
         renderer: Renderer = ctx.renderer
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
         noise_seed = seeds.stream(renderer.root_seed, "gradient", ctx.seed)
-        cotangent = renderer.replace_non_finite(cotangent[..., :3])
+        cotangent = renderer.replace_non_finite(cotangent)
         by_input = dict[str, Tensor]()
         remaining = list(inputs)
         # what two reach goes to the more general one
@@ -777,7 +783,7 @@ class _Radiance(torch.autograd.Function):
             if estimator == "material":
                 meshes = sorted({name.rpartition(".")[0] for name in wrt})
                 gradients = renderer.scene.render_material_adjoint(
-                    inputs, cotangent, noise_seed, ctx.spp, meshes=meshes
+                    inputs, cotangent[..., :3], noise_seed, ctx.spp, meshes=meshes
                 )
             else:
                 method = "hidden" if ctx.hide else "path"

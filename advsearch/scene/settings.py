@@ -495,6 +495,15 @@ GROUND = (
         3.0,
         "Side of the table; 0 leaves the ground out.",
     ),
+    Parameter(
+        "level",
+        (),
+        "object sizes",
+        -1e4,
+        1e4,
+        0.0,
+        "Height of the ground that takes the shadow in a photograph (`backdrop`).",
+    ),
     *Parameter.colors(
         "of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)
     ),

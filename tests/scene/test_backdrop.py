@@ -14,7 +14,9 @@ from PIL import Image
 import advsearch
 from advsearch.engine.loading import Scene, fit_camera
 from advsearch.errors import FileFormatError, InputError
+from advsearch.scene import assets
 from advsearch.scene.backdrop import (
+    compute_plane_radiance,
     compute_view_settings,
     make_backdrop,
     make_matrix_camera,
@@ -52,7 +54,7 @@ def photograph(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.medium
 def test_the_picture_is_the_object_over_the_photograph_by_its_coverage(photograph: Path) -> None:
-    scene = advsearch.load_scene("mug", backdrop=photograph, settings={"camera.exposure": 0.5})
+    scene = advsearch.load_scene("mug", backdrop=photograph, settings={"camera.exposure": 0.5, "ground.size": 0.0})
     render = scene.renderer("texture", resolution=SIZE, denoise="none")
     picture = render(render.start, seed=4, spp=16).detach().numpy()
     inputs = render.compute_scene_inputs(render.start)
@@ -81,6 +83,107 @@ def test_the_derivative_in_a_photograph_is_that_of_differences(photograph: Path)
         ends = [(weights * render((u + sign * step * direction).clamp(0, 1), 1, 256)).sum() for sign in (1.0, -1.0)]
     difference = float(ends[0] - ends[1]) / (2.0 * step)
     assert float(u.grad @ direction) == pytest.approx(difference, rel=0.02)
+
+
+# ---- the shadow
+
+TABLE = {"ground.size": 12.0, "ground.red": 0.5, "ground.green": 0.4, "ground.blue": 0.3}
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, np.ndarray, float]:
+    """A photograph of a table that is a render, and what the same render shows with the mug on it."""
+    scene = advsearch.load_scene("mug", settings=TABLE | {"ground.kind": "table"})
+    render = scene.renderer("texture", resolution=48, denoise="none")
+    full = render(render.start, 0, 400).detach().numpy()
+    empty = scene.renderer("texture", resolution=48, denoise="none")
+    empty.scene.assembly.is_object_hidden = True
+    path = tmp_path_factory.mktemp("photographs") / "table.png"
+    levels = np.round(empty(empty.start, 5, 400).detach().numpy() * 255.0).astype(np.uint8)
+    Image.fromarray(levels).save(path)
+    return path, full, render.mask(render.start).numpy(), scene.description.gain
+
+
+@pytest.mark.medium
+def test_the_composition_is_the_full_render_of_the_scene_that_was_photographed(
+    table: tuple[Path, np.ndarray, np.ndarray, float],
+) -> None:
+    path, full, mask, gain = table
+    plain = load_description("mug", given=TABLE).with_backdrop(path)
+    settings = TABLE | {"camera.exposure": float(np.log2(gain / plain.gain))}
+    scene = advsearch.load_scene("mug", settings=settings, backdrop=path)
+    render = scene.renderer("texture", resolution=48, denoise="none")
+    picture = render(render.start, 1, 400).detach().numpy()
+    photograph = np.asarray(Image.open(path)).astype(np.float64) / 255.0
+    error = np.abs(picture - full) * 255.0
+    in_shadow = ~mask & (np.abs(full - photograph).max(axis=2) * 255.0 > 6.0)
+    assert in_shadow.sum() > 100 and (photograph - full)[in_shadow].mean() * 255.0 > 10.0, "there is a shadow"
+    assert error.mean() < 1.3, f"{error.mean():.2f} levels"
+    assert abs((picture - full)[in_shadow].mean()) * 255.0 < 0.5, "it is neither darker nor lighter on average"
+    # denoised, from a few samples, it is as near
+    denoised = scene.renderer("texture", resolution=48)
+    few = denoised(denoised.start, 1, 16).detach().numpy()
+    assert np.abs(few - full)[in_shadow].mean() * 255.0 < 2.5
+
+
+@pytest.mark.medium
+def test_the_ground_is_darker_below_the_object_and_as_it_was_far_away(tmp_path: Path) -> None:
+    Image.new("RGB", (64, 48), (120, 160, 90)).save(tmp_path / "a.png")
+    scene = advsearch.load_scene("mug", backdrop=tmp_path / "a.png", settings={"camera.distance": 4.0})
+    for denoise in ("none", "oidn"):
+        render = scene.renderer("texture", resolution=(48, 64), denoise=denoise)
+        levels = np.round(render(render.start, 0, 36).detach().numpy() * 255.0)
+        change = levels - np.array([120, 160, 90])
+        mask = render.mask(render.start).numpy()
+        rows, columns = np.nonzero(mask)
+        below = change[rows.max() + 1, columns.min() : columns.max()]
+        assert below.min() < -15 and below.max() <= 1, denoise
+        corners = [change[:6, :6], change[:6, -6:], change[-4:, :4], change[-4:, -4:]]
+        # of a few samples there is one that meets the mug, and changes its pixel by a level
+        assert max(np.abs(corner).max() for corner in corners) <= 1, denoise
+        assert max(np.abs(corner).mean() for corner in corners) < 0.3, denoise
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("control", ["light.power", "texture", "pose.yaw"])
+def test_the_derivative_with_a_shadow_is_that_of_differences(tmp_path: Path, control: str) -> None:
+    Image.new("RGB", (32, 32), (120, 160, 90)).save(tmp_path / "a.png")
+    controls: dict[str, object] = {
+        "light.power": {"light": {"power": [0.2, 2.0]}},
+        "texture": {"texture": {"resolution": 2}},
+        "pose.yaw": {"pose": {"yaw": [0.0, 90.0]}},
+    }
+    scene = advsearch.load_scene("mug", backdrop=tmp_path / "a.png", settings={"camera.exposure": -1.0})
+    render = scene.renderer(controls[control], resolution=32, denoise="none")
+    u = torch.full((len(render.start),), 0.4)
+    leaf = u.clone().requires_grad_()
+    for part in (render.mask(u), ~render.mask(u)):
+        weights = part[..., None] * torch.linspace(0.2, 1.0, 32)[None, :, None]
+        (slope,) = torch.autograd.grad((weights * render(leaf, 1, 256)).sum(), leaf)
+        with torch.no_grad():
+            above, below = ((weights * render(u + step, 1, 256)).sum() for step in (0.03, -0.03))
+        assert float(slope.sum()) == pytest.approx(float(above - below) / 0.06, rel=0.03, abs=0.02)
+
+
+def test_light_and_ground_follow_from_the_photograph(tmp_path: Path) -> None:
+    """A level grey card of the mean reflectance is as bright as the photograph is on average."""
+    levels = np.full((48, 64, 3), 200, np.uint8)
+    levels[:24] = 60
+    Image.fromarray(levels).save(tmp_path / "a.png")
+    environment = assets.EnvironmentAsset("even", np.full((16, 32, 3), 2.0, np.float32))
+    scene = load_description("mug", environment).with_backdrop(tmp_path / "a.png")
+    irradiance = np.pi * 2.0  # of a level surface under an even sky
+    mean = (decode(np.array([200]))[0] + decode(np.array([60]))[0]) / 2.0
+    assert scene.gain * 0.3 * irradiance / np.pi == pytest.approx(mean, rel=1e-5)
+    fitted = fit_camera(scene, (48, 64))
+    shown = decode(np.array([200]))[0]  # the mug stands in the lower half
+    albedo = shown / (scene.gain * irradiance / np.pi)
+    expected = 255.0 * encode(np.array([min(albedo, 0.8)]))[0]
+    assert fitted.number("ground.red") * 255.0 == pytest.approx(expected, abs=0.5)
+    plane = compute_plane_radiance(fitted)
+    assert plane is not None and plane[0] == pytest.approx(min(albedo, 0.8) * irradiance / np.pi, rel=1e-3)
+    below = load_description("mug", environment, given={"camera.elevation": -20.0}).with_backdrop(tmp_path / "a.png")
+    assert compute_plane_radiance(below) is None, "the camera is below the ground"
 
 
 def test_a_photograph_is_averaged_in_linear_light(tmp_path: Path) -> None:
@@ -222,7 +325,8 @@ def test_a_camera_of_another_shape_several_cameras_and_a_ground_are_refused(tmp_
     (tmp_path / "cam.yaml").write_text("image_width: 480\nimage_height: 640\nfx: 500\nfy: 500\ncx: 240\ncy: 320\n")
     scene = load_description("mug")
     refuse("was turned or cropped", scene.with_camera(str(tmp_path / "cam.yaml")), tmp_path / "a.png")
-    refuse("ground of its own", load_description("mug", given={"ground.size": 4.0}), tmp_path / "a.png")
+    table = load_description("mug", given={"ground.kind": "photograph"})
+    refuse("a plane that takes the shadow", table, tmp_path / "a.png")
     refuse("drops would show", load_description("mug", given={"camera.drops": 5.0}), tmp_path / "a.png")
     part = scene.with_camera("equirectangular")
     refuse("shows all around", part, f"{tmp_path / 'a.png'}#0,0,16,12", (12, 16))

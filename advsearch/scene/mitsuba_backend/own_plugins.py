@@ -108,6 +108,8 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
 
 
 common: Any = mi.ad.integrators.common
+PRBIntegrator: Any = mi.ad.integrators.prb.PRBIntegrator
+PLANE_SHAPE = "ground"  # Mitsuba's id of the plane that takes the shadow
 ISOTROPIC_PHASE = 1.0 / (4.0 * math.pi)  # isotropic phase function, per steradian
 MIN_EXTINCTION = 1e-20
 MAX_SCATTERINGS = 8
@@ -366,6 +368,104 @@ def _make_event(ray: Any, si: Any, scattered: Any, distance: Any) -> Any:
 
 
 mi.register_integrator("advsearch_haze", lambda props: HazePath(props))
+
+
+class PhotographPath(PRBIntegrator):  # type: ignore[misc]
+    """Trace paths for a scene that is rendered into a photograph, with an adjoint.
+
+    It is the integrator `advsearch_photograph`. The plane that takes the shadow, the
+    shape `ground`, is not seen. Where a camera ray meets it first, the change of its
+    radiance by all that is in the scene beside it and the environment is in three more
+    channels:
+
+        - light of the environment that is kept from it + light of lamps
+        + light that other surfaces send to it
+
+    Both are exactly zero where nothing is in the way, so that the photograph stays as
+    it is there, without noise. The object sees the plane as any other surface.
+
+    The derivative is that of `prb` on what is left of the path.
+    """
+
+    def sample(
+        self,
+        mode: Any,
+        scene: Any,
+        sampler: Any,
+        ray: Any,
+        δL: Any,
+        state_in: Any,
+        active: Any,
+        δaovs: Any = None,
+        **rest: Any,
+    ) -> Any:
+        """Sample paths, or replay them; see `mi.ad.integrators.common.RBIntegrator`."""
+        ray = mi.Ray3f(dr.detach(ray))
+        active = mi.Bool(active)
+        plane = next(shape for shape in scene.shapes() if shape.id() == PLANE_SHAPE)
+        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        on_plane = active & hit.is_valid() & (hit.shape == mi.ShapePtr(plane))
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, on_plane)
+        bsdf = si.bsdf()
+        context = mi.BSDFContext()
+
+        ds, light = scene.sample_emitter_direction(
+            si, sampler.next_2d(), False, on_plane
+        )
+        is_sampled = on_plane & (ds.pdf != 0.0)
+        is_blocked = scene.ray_test(si.spawn_ray_to(ds.p), is_sampled)
+        is_environment = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        factor = dr.select(
+            is_environment,
+            dr.select(is_blocked, -1.0, 0.0),
+            dr.select(is_blocked, 0.0, 1.0),
+        )
+        reflected = bsdf.eval(context, si, si.to_local(ds.d), is_sampled)
+        reflected *= dr.select(is_sampled, factor, 0.0)
+
+        bounce, weight = bsdf.sample(
+            context, si, sampler.next_1d(), sampler.next_2d(), on_plane
+        )
+        bounced = si.spawn_ray(si.to_world(bounce.wo))
+        path_ray = dr.select(on_plane, bounced, ray)
+        is_traced = active & (~on_plane | (bounce.pdf > 0.0))
+        if mode != dr.ADMode.Primal:
+            change = mi.Spectrum(*δaovs)
+            δL = dr.select(on_plane, weight * change, δL)
+            with dr.resume_grad():
+                attached = scene.eval_emitter_direction(si, ds, is_sampled)
+                attached *= reflected * dr.select(is_sampled, dr.rcp(ds.pdf), 0.0)
+                if dr.grad_enabled(attached):
+                    # The path goes along the same edges later: they are kept.
+                    dr.backward_from(change * attached, dr.ADFlag.ClearInterior)
+        L, valid, _, state_out = super().sample(
+            mode=mode,
+            scene=scene,
+            sampler=sampler,
+            ray=path_ray,
+            δL=δL,
+            state_in=state_in,
+            active=is_traced,
+            **rest,
+        )
+        arrived = dr.select(on_plane, weight * L + reflected * light, 0.0)
+        color = dr.select(on_plane, 0.0, L)
+        return color, valid & ~on_plane, [*arrived], state_out
+
+    def sample_rays(self, scene: Any, sensor: Any, sampler: Any, **rest: Any) -> Any:
+        """Return rays, weights and positions, with weights that are plain numbers.
+
+        Mitsuba 3.9.1 multiplies each further channel by a weight of three channels in
+        `render_backward`, which fails. Our cameras' weights are grey.
+        """
+        ray, weight, position = super().sample_rays(scene, sensor, sampler, **rest)
+        return ray, mi.Float(weight[0]), position
+
+    def aov_names(self) -> list[str]:
+        return [f"plane.{channel}" for channel in "RGB"]
+
+
+mi.register_integrator("advsearch_photograph", lambda props: PhotographPath(props))
 
 
 class Guides(mi.SamplingIntegrator):  # type: ignore[misc]

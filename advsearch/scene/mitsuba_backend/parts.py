@@ -16,6 +16,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.scene import parts
+from advsearch.scene.backdrop import has_plane
 from advsearch.scene.camera_model import NUMBER_NAMES
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -476,11 +477,18 @@ def _make_ground(description: SceneDescription) -> Any:
     size = description.number("ground.size")
     if not size > 0.0 or is_paved(description):
         return None
+    level = 0.0
+    if description.backdrop_photograph is not None:
+        if not has_plane(description):
+            return None
+        level = description.number("ground.level")
     srgb = np.array(description.ground_color, np.float32)
     reflectance = _make_rgb(srgb_to_linear(srgb).tolist())
     return {
         "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().scale(size / 2.0),
+        "to_world": mi.ScalarTransform4f()
+        .translate([0.0, 0.0, level])
+        .scale(size / 2.0),
         "bsdf": {
             "type": "twosided",
             "bsdf": {"type": "diffuse", "reflectance": reflectance},

@@ -93,6 +93,7 @@ def collect_paths(
     depth: int,
     spp: int,
     projector: Any,
+    unseen: Any = None,
 ) -> Paths:
     """Trace one pass of light paths and collect their vertices.
 
@@ -108,8 +109,13 @@ def collect_paths(
         depth: maximum length of a path in segments.
         spp: samples per pixel.
         projector: Mitsuba's projector whose image `key` is; None for a base color.
+        unseen: Mitsuba's shape that camera rays see nothing of, nor behind it.
     """
     ray, weight = _sample_camera_rays(scene.sensors()[0], noise, size, spp)
+    if unseen is not None:
+        hit = scene.ray_intersect_preliminary(ray, coherent=True)
+        is_unseen = hit.is_valid() & (hit.shape == mi.ShapePtr(unseen))
+        weight = dr.select(is_unseen, 0.0, weight)
     first_hit, emitted, bounces = _trace_paths(scene, ray, weight, noise, depth)
 
     # The BSDFs are evaluated once more with the base color larger by `COLOR_STEP`:

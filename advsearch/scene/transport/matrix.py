@@ -550,6 +550,9 @@ def _collect(
             transport.finish(smooth)
         if hide:
             base = torch.cat([base, paths.coverage], dim=-1)
+        if "backdrop.plane" in applied:  # the plane's change stays as it is there
+            traced_image = renderer.render_radiance(traced, seed, spp, hide)
+            base = torch.cat([base, traced_image[..., 4:]], dim=-1)
     return LinearizedScene(
         transports=transports,
         linearized_at=linearized_at,
