@@ -110,10 +110,10 @@ from advsearch.registry import load_attribute
 from advsearch.runs.results import AxisValue as AxisValue
 from advsearch.runs.store import Row as Row
 from advsearch.runs.summary import read_configuration as read_configuration
+from advsearch.runs.tables import read_units as read_units
 from advsearch.runs.tables import units_of as units_of
 from advsearch.runs.twins import find_twin_evidence as find_twin_evidence
 from advsearch.runs.twins import read_twins as read_twins
-from advsearch.runs.tables import read_units as read_units
 from advsearch.scene import library as library
 from advsearch.scene.assembly import pose_mesh as pose_mesh
 from advsearch.scene.camera_files import read_camera as read_camera
@@ -132,9 +132,9 @@ from advsearch.threads import all_for_torch as all_for_torch
 from advsearch.threads import count_cores as count_cores
 from advsearch.trust.code import allow_named as allow_named
 from advsearch.trust.programs import find_blender as find_blender
+from advsearch.trust.programs import make_environment as make_environment
 from advsearch.trust.programs import surroundings as surroundings
 from advsearch.trust.yaml_text import parse_yaml as parse_yaml
-from advsearch.trust.programs import make_environment as make_environment
 
 
 def load_photographs() -> Any:

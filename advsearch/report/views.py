@@ -201,7 +201,7 @@ def list_remarks(result: Result, view: ShownResult) -> list[str]:
         remarks.append("It is running: this is what has come out so far.")
     twins = getattr(result, "twins", None)
     if twins is not None:
-        remarks.append(wording.twins_text(twins))
+        remarks.append(wording.format_twin_evidence(twins))
     return [*remarks, *view.cautions, *getattr(result, "warnings", ())]
 
 

@@ -583,7 +583,7 @@ def format_extent(extent: Extent) -> str:
     )
 
 
-def estimate_text(estimate: Estimate | None, otherwise: str = "") -> str:
+def format_estimate(estimate: Estimate | None, otherwise: str = "") -> str:
     """Return a number with its interval: ``.96 (.94 to .98)``."""
     if estimate is None:
         return otherwise
@@ -599,7 +599,7 @@ def _two_decimals(value: float) -> str:
     return text.replace("0.", ".", 1) if abs(value) < 0.995 else text
 
 
-def twins_text(evidence: TwinEvidence) -> str:
+def format_twin_evidence(evidence: TwinEvidence) -> str:
     """Return in a sentence or two how far a verdict holds for photographs."""
     name = PurePath(evidence.run).name
     row = evidence.row
@@ -618,8 +618,8 @@ def twins_text(evidence: TwinEvidence) -> str:
         surroundings += ", not in these surroundings"
     agreement = (
         f"Photographs ({name}; {of_objects}; renders {surroundings}): this model was "
-        f"right or wrong on both in {estimate_text(row.agreement)} of "
-        f"{count(row.pairs, 'pair')} of {count(row.frames, 'frame')}."
+        f"right or wrong on both in {format_estimate(row.agreement)} of "
+        f"{format_count(row.pairs, 'pair')} of {format_count(row.frames, 'frame')}."
     )
     failing = f"{row.both_wrong} of {row.wrong_twins}"
     if row.wrong_where_twin_wrong is None:
@@ -629,8 +629,8 @@ def twins_text(evidence: TwinEvidence) -> str:
         )
     return (
         f"{agreement} A failing render was a failing photograph in "
-        f"{estimate_text(row.wrong_where_twin_wrong)} ({failing}); photographs failed "
-        f"in {estimate_text(row.photo_wrong)} at all."
+        f"{format_estimate(row.wrong_where_twin_wrong)} ({failing}); photographs failed "
+        f"in {format_estimate(row.photo_wrong)} at all."
     )
 
 

@@ -238,7 +238,7 @@ class RunResult(Result):
         description="parts that existed only in Python, so that no command "
         "asks the same; absent without",
     )
-    twins: TwinEvidence | None = optional(
+    twins: TwinEvidence | None = optional_field(
         "how far verdicts hold for photographs, by the run of twins that was named; "
         "absent without"
     )

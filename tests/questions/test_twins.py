@@ -22,7 +22,7 @@ from advsearch.questions.twins.carry_out import parse_frames
 from advsearch.questions.twins.listing import Pinhole, read_photographs
 from advsearch.questions.twins.result import COMPOSED, HOLE, TwinPrediction, TwinRow, TwinsResult
 from advsearch.report import wording
-from advsearch.report.views import remarks_of, shown
+from advsearch.report.views import get_view, list_remarks
 from advsearch.runs import twins as runs_twins
 from advsearch.runs.results import IN_PHOTOGRAPH, WITHOUT_OBJECT, Estimate, TwinAgreement, TwinEvidence, TwinMatch
 from small_models import SMALL_ATTACK
@@ -143,12 +143,12 @@ def test_an_attack_states_what_the_run_of_twins_measured(compared: TwinsResult, 
     assert summary.twins.match is TwinMatch.MEASURED
     assert summary.twins.row.surroundings == "studio" and summary.twins.same_surroundings
     assert not summary.twins.same_object and not summary.twins.row.object
-    (remark,) = [text for text in remarks_of(summary, shown(summary)) if text.startswith("Photographs (")]
+    (remark,) = [text for text in list_remarks(summary, get_view(summary)) if text.startswith("Photographs (")]
     assert "12 pairs of 12 frames" in remark and "Too few renders failed" in remark
     other = advsearch.load_model(RedOrBlue(), labels=["cup", "box"], input_size=32, name="other")
     summary = advsearch.attack("mug", other, environment="studio", **settings).summary
     assert summary.twins is not None and summary.twins.match is TwinMatch.OTHER_MODEL
-    assert any("was not measured" in text for text in remarks_of(summary, shown(summary)))
+    assert any("was not measured" in text for text in list_remarks(summary, get_view(summary)))
 
 
 def make_agreement(**changed: Any) -> TwinAgreement:
@@ -187,7 +187,7 @@ def test_the_nearest_conditions_are_those_of_object_and_surroundings(monkeypatch
     assert describe(find("can", "studio", in_photograph=True)) == ("can", IN_PHOTOGRAPH, True, True)
     assert describe(find("mug", "room")) == ("", "room", False, True)
     evidence = find("mug", "room", in_photograph=True)
-    text = wording.twins_text(evidence)
+    text = wording.format_twin_evidence(evidence)
     assert text == (
         "Photographs (r; all objects together, not of this object; renders composed over their photographs): this "
         "model was right or wrong on both in .90 (.80 to .95) of 80 pairs of 20 frames. A failing render was a failing "

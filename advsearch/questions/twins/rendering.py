@@ -153,12 +153,14 @@ class ObjectRenderer:
         self._asset = asset
         self._spp = spp
         self._seed = seed
-        lit = workbench.load_scene(asset, light, unit=unit)
-        self._hidden = lit.renderer(
-            {"background": {"ground": "hide"}}, resolution=film, seed=seed
+        self._hidden = _make_renderer(
+            workbench.load_scene(asset, light, unit=unit),
+            {"background": {"ground": "hide"}},
+            film,
+            seed,
         )
-        self._surrounded = workbench.load_scene(asset, environment, unit=unit).renderer(
-            "camera", resolution=film, seed=seed
+        self._surrounded = _make_renderer(
+            workbench.load_scene(asset, environment, unit=unit), "camera", film, seed
         )
         self.environment = environment
 
@@ -235,6 +237,26 @@ class ObjectRenderer:
             enlarge(surfaces.z_depth) * (metres or 1.0),
             metres,
         )
+
+
+def _make_renderer(
+    scene: workbench.Scene, controls: Any, film: tuple[int, int], seed: int
+) -> Any:
+    """Return a renderer that is not differentiated, and that records nothing.
+
+    A recorded render of one scene fails while another with a place lives.
+    """
+    loading = workbench.loading
+    description = loading.fit_camera(scene.description, film)
+    return loading.make_renderer(
+        description,
+        loading.make_space(loading.make_controls(controls), description),
+        film,
+        "oidn",
+        seed,
+        leave_out=loading.ALL_OMISSIONS - {"tracing"},
+        differentiated=False,
+    )
 
 
 def choose_film(windows: Sequence[Window], pixel_aspect: float) -> tuple[int, int]:

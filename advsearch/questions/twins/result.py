@@ -265,12 +265,12 @@ def find_row(
     return None
 
 
-def conditional_text(row: results.TwinAgreement) -> str:
+def format_conditional(row: results.TwinAgreement) -> str:
     """Return how often the photograph is wrong where the twin is."""
     counts = f"{row.both_wrong} of {row.wrong_twins}"
     if row.wrong_where_twin_wrong is None:
         return f"too few wrong: {counts}"
-    return f"{wording.estimate_text(row.wrong_where_twin_wrong)}, {counts}"
+    return f"{wording.format_estimate(row.wrong_where_twin_wrong)}, {counts}"
 
 
 HEADS = (
@@ -288,11 +288,11 @@ def _agreement_cells(row: results.TwinAgreement, name: str) -> list[str]:
     return [
         name,
         str(row.pairs),
-        wording.estimate_text(row.twin_right),
-        wording.estimate_text(row.agreement),
-        wording.estimate_text(row.kappa, "too few wrong"),
-        wording.estimate_text(row.margins),
-        conditional_text(row),
+        wording.format_estimate(row.twin_right),
+        wording.format_estimate(row.agreement),
+        wording.format_estimate(row.kappa, "too few wrong"),
+        wording.format_estimate(row.margins),
+        format_conditional(row),
     ]
 
 
@@ -303,12 +303,12 @@ def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
     photo = [
         PHOTOGRAPH,
         str(first.pairs),
-        wording.estimate_text(first.photo_right),
+        wording.format_estimate(first.photo_right),
         "",
         "",
         "",
     ]
-    photo.append(f"wrong at all: {wording.estimate_text(first.photo_wrong)}")
+    photo.append(f"wrong at all: {wording.format_estimate(first.photo_wrong)}")
     rows = [photo, *(_agreement_cells(row, _name_surroundings(row)) for row in total)]
     return ResultPart("How far twins hold", heads=HEADS, rows=rows, note=TABLE_NOTE)
 
@@ -343,7 +343,7 @@ def _factor_part(result: TwinsResult) -> ResultPart:
                 part.factor,
                 f"{bounds} {part.unit}".strip(),
                 f"{part.disagreeing} of {part.pairs}",
-                wording.estimate_text(part.rate),
+                wording.format_estimate(part.rate),
             ]
         )
     return ResultPart(
@@ -393,16 +393,16 @@ def summarize_twins(table: Sequence[results.TwinAgreement]) -> str:
     if composed is None:
         return "Nothing was compared."
     sentences = [
-        f"Over {wording.count(composed.pairs, 'pair')} of "
-        f"{wording.count(composed.frames, 'frame')}, the model says of the twin in the "
+        f"Over {wording.format_count(composed.pairs, 'pair')} of "
+        f"{wording.format_count(composed.frames, 'frame')}, the model says of the twin in the "
         f"photograph what it says of the photograph, right or wrong, in "
-        f"{wording.estimate_text(composed.agreement)}."
+        f"{wording.format_estimate(composed.agreement)}."
     ]
     if composed.wrong_where_twin_wrong is not None:
         sentences.append(
             f"Where that twin is wrong, the photograph is wrong in "
-            f"{wording.estimate_text(composed.wrong_where_twin_wrong)}, and in "
-            f"{wording.estimate_text(composed.photo_wrong)} at all."
+            f"{wording.format_estimate(composed.wrong_where_twin_wrong)}, and in "
+            f"{wording.format_estimate(composed.photo_wrong)} at all."
         )
     else:
         sentences.append(
@@ -458,10 +458,13 @@ def make_twins_claims(result: TwinsResult) -> Iterator[views.Claim]:
             row.agreement.interval,
             row.agreement.value,
         )
+        counts = (
+            f"{wording.format_count(row.pairs, 'pair')} of "
+            f"{wording.format_count(row.frames, 'frame')}"
+        )
         statement = (
             f"{_name_surroundings(row)}: agrees with the photograph in "
-            f"{wording.estimate_text(row.agreement)} of {wording.count(row.pairs, 'pair')} of "
-            f"{wording.count(row.frames, 'frame')}; photographs wrong where it is "
-            f"wrong: {conditional_text(row)}."
+            f"{wording.format_estimate(row.agreement)} of {counts}; photographs wrong "
+            f"where it is wrong: {format_conditional(row)}."
         )
         yield views.Claim(kind="measured", statement=statement, extent=extent)
