@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from PIL import Image, ImageDraw
 
 from advsearch.questions.twins import rendering
@@ -36,15 +35,14 @@ N_FRAMES = 12
 NOISE = 0.02  # standard deviation, sRGB
 DIM = 0.45  # of the light of every third photograph
 ENVIRONMENT = "loft"
+WINDOW = rendering.Window(0, 0, WIDTH, HEIGHT)
 Mesh = tuple[Float64Array, IntArray, IntArray]  # vertices in mm, faces, 8-bit colors
 
 
 def make_cup() -> Mesh:
     """Return a cup with bands, 80 mm high: a closed surface of revolution."""
-    profile = np.array(
-        [[0, 0], [30, 0], [34, 25], [36, 50], [40, 80], [36, 80], [32, 50], [28, 8]]
-        + [[0, 8]],
-        np.float64,
+    profile = np.loadtxt(
+        "0 0; 30 0; 34 25; 36 50; 40 80; 36 80; 32 50; 28 8; 0 8".split(";")
     )
     n_columns = 24
     angle = 2.0 * math.pi * np.arange(n_columns) / n_columns
@@ -154,14 +152,11 @@ def main() -> int:
     for number, mesh in meshes.items():
         path = FOLDER / "models" / f"obj_{number:06d}.ply"
         write_ply(path, mesh)
-        renderers[number] = rendering.ObjectRenderer(
+        renderers[number] = rendering.SurroundedRenderer(
             rendering.load_object(path, "mm"),
             "mm",
-            light=ENVIRONMENT,
-            environment=ENVIRONMENT,
-            film=rendering.choose_film(
-                [rendering.Window(0, 0, WIDTH, HEIGHT)], INTRINSICS[0] / INTRINSICS[1]
-            ),
+            ENVIRONMENT,
+            rendering.choose_film([WINDOW], INTRINSICS[0] / INTRINSICS[1]),
             spp=64,
             seed=7,
         )
@@ -183,15 +178,10 @@ def main() -> int:
         item = PhotographedObject(
             Path(), "", "", mesh_file, "mm", pose, Pinhole(fx, fy, cx + 0.5, cy + 0.5)
         )
-        twin = renderers[number].render(
-            item,
-            torch.zeros(HEIGHT, WIDTH, 3),
-            rendering.Window(0, 0, WIDTH, HEIGHT),
-            (HEIGHT, WIDTH),
-            number=frame,
-        )
+        rendered = renderers[number].render(item, WINDOW, frame)
         is_dim = frame % 3 == 2
-        image = twin.images[ENVIRONMENT].numpy() * (DIM if is_dim else 1.0)
+        image = rendering.resize(rendered, (HEIGHT, WIDTH)).numpy()
+        image = image * (DIM if is_dim else 1.0)
         image = image + NOISE * generator.standard_normal(image.shape)
         levels = np.round(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
         name = f"{frame:06d}"

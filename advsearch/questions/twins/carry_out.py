@@ -5,11 +5,12 @@ The rows are stored one by one, so that a run that was stopped goes on.
 
 from __future__ import annotations
 
+import gc
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,6 @@ from advsearch.questions.twins.result import (
 
 LOW_OVERLAP = 0.8  # of silhouettes: below it a pose is doubted
 IMAGE_SIZE = 160  # longer side, pixels, of images on the page
-RENDERS_PER_ROW = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,51 +190,86 @@ class Comparison:
             key = (item.mesh, round(item.camera.pixel_aspect, 3))
             groups.setdefault(key, []).append(number)
         for numbers in groups.values():
+            missing = [
+                number
+                for number in numbers
+                if measurements.stored(make_row_name(number)) is None
+            ]
+            # Mitsuba can't record renders of one scene while another one lives.
+            layers = self._render_layers(selection, missing)
+            gc.collect()
             renderer = None
+            if missing:
+                renderer = self._make_renderer(
+                    rendering.SurroundedRenderer,
+                    self._config.environment_name,
+                    selection,
+                    missing,
+                )
             for number in numbers:
-                name = f"twin {number}"
-                if renderer is None and measurements.stored(name) is None:
-                    renderer = self._make_renderer(selection, numbers)
+                layer = layers.pop(number, None)
                 yield measurements.get_row(
-                    name,
+                    make_row_name(number),
                     TwinRow,
-                    lambda number=number, renderer=renderer: self._compare_object(
-                        number, selection, renderer
-                    ),
+                    partial(self._compare_object, number, selection, layer, renderer),
                 )
                 context.progress.advance(1)
+            renderer = None
+            gc.collect()
+
+    def _render_layers(
+        self, selection: Selection, numbers: Sequence[int]
+    ) -> dict[int, rendering.Layer]:
+        """Render the objects of some rows, which have one mesh, alone."""
+        if not numbers:
+            return {}
+        renderer = self._make_renderer(
+            rendering.LayerRenderer, self._config.light, selection, numbers
+        )
+        layers = {}
+        for number in numbers:
+            item = selection.objects[number]
+            window = selection.windows[number]
+            layers[number] = renderer.render(item, window, self._size, number)
+            self.n_renders += 1
+        return layers
 
     def _make_renderer(
-        self, selection: Selection, numbers: Sequence[int]
-    ) -> rendering.ObjectRenderer:
+        self,
+        renderer_type: Any,
+        environment: str,
+        selection: Selection,
+        numbers: Sequence[int],
+    ) -> Any:
         item = selection.objects[numbers[0]]
-        config = self._config
-        return rendering.ObjectRenderer(
+        film = rendering.choose_film(
+            [selection.windows[number] for number in numbers], item.camera.pixel_aspect
+        )
+        return renderer_type(
             self._load_asset(item),
             item.unit,
-            light=config.light,
-            environment=config.environment_name,
-            film=rendering.choose_film(
-                [selection.windows[number] for number in numbers],
-                item.camera.pixel_aspect,
-            ),
-            spp=config.spp,
-            seed=config.seed,
+            environment,
+            film,
+            spp=self._config.spp,
+            seed=self._config.seed,
         )
 
     def _compare_object(
         self,
         number: int,
         selection: Selection,
-        renderer: rendering.ObjectRenderer,
+        layer: rendering.Layer,
+        renderer: rendering.SurroundedRenderer,
     ) -> TwinRow:
-        """Render an object's twins, and return what the model says of all images."""
+        """Render an object's twin, and return what the model says of all images."""
         item = selection.objects[number]
         window = selection.windows[number]
-        twin = renderer.render(
-            item, self._load_photo(item), window, self._size, number=number
+        environment = self._config.environment_name
+        surrounded = {environment: renderer.render(item, window, number)}
+        self.n_renders += 1
+        twin = rendering.make_twin(
+            item, self._load_photo(item), window, layer, surrounded, self._size
         )
-        self.n_renders += RENDERS_PER_ROW
         facts = self._make_facts(item, twin)
         self._save_images(number, twin)
         return TwinRow(
@@ -288,7 +323,7 @@ class Comparison:
     def _save_images(self, number: int, twin: rendering.Twin) -> None:
         """Store small images of the photograph and its twins."""
         for index, name in enumerate(list(twin.images)[:3]):
-            file = image_name(number, index)
+            file = make_image_name(number, index)
             self._context.run.write_file(file, encode_jpeg(twin.images[name]))
 
     def make_result(
@@ -316,7 +351,7 @@ class Comparison:
             pairs=[
                 TwinPair(
                     row=row,
-                    pictures=[image_name(row.number, index) for index in range(3)],
+                    pictures=[make_image_name(row.number, index) for index in range(3)],
                 )
                 for row in worst
             ],
@@ -370,7 +405,12 @@ def parse_frames(text: str | None) -> Any:
     return is_used
 
 
-def image_name(number: int, index: int) -> str:
+def make_row_name(number: int) -> str:
+    """Return the key of a stored row."""
+    return f"twin {number}"
+
+
+def make_image_name(number: int, index: int) -> str:
     """Return the file of an image of a row in the run's folder."""
     return f"images/twin-{number:06d}-{index}.jpg"
 

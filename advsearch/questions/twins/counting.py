@@ -101,13 +101,13 @@ def estimate_rate(happens: BoolArray, units: IntArray) -> results.Estimate:
 
 
 def estimate_conditional(
-    event: BoolArray, given_event: BoolArray, units: IntArray
+    event: BoolArray, condition: BoolArray, units: IntArray
 ) -> results.Estimate | None:
     """Return the rate of an event where another happens; None in too few units."""
-    n_units = statistics.agreement.count_units(given_event, units)
+    n_units = statistics.agreement.count_units(condition, units)
     if n_units < statistics.agreement.MIN_UNITS:
         return None
-    return estimate_rate(event[given_event], units[given_event])
+    return estimate_rate(event[condition], units[condition])
 
 
 def estimate_kappa(

@@ -126,14 +126,28 @@ def choose_window(
     return Window(x, y, width, height)
 
 
-class ObjectRenderer:
-    """Render the twins of one object.
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """An object alone, as the camera of a photograph sees it in a window.
+
+    Attributes:
+        radiance: (h, w, 3) display-linear, times its alpha, at the film's size.
+        alpha: (h, w) what the object covers.
+        sight: what is visible of it, at the model's size.
+    """
+
+    radiance: Tensor
+    alpha: Tensor
+    sight: Any
+
+
+class LayerRenderer:
+    """Render layers of one object.
 
     Args:
         asset: the object, with `up` z and `front` +x.
         unit: of its file.
-        light: environment that lights it in the photograph.
-        environment: bundled one that surrounds it in the other twin.
+        light: environment that lights it.
         film: (height, width) of renders in pixels.
         spp: samples per pixel.
         seed: of the noise.
@@ -143,119 +157,137 @@ class ObjectRenderer:
         self,
         asset: assets.ObjectAsset,
         unit: str,
-        *,
         light: str,
-        environment: str,
         film: tuple[int, int],
+        *,
         spp: int,
         seed: int,
     ) -> None:
         self._asset = asset
         self._spp = spp
         self._seed = seed
-        self._hidden = _make_renderer(
-            workbench.load_scene(asset, light, unit=unit),
-            {"background": {"ground": "hide"}},
-            film,
-            seed,
+        self._renderer = workbench.load_scene(asset, light, unit=unit).renderer(
+            {"background": {"ground": "hide"}}, resolution=film, seed=seed
         )
-        self._surrounded = _make_renderer(
-            workbench.load_scene(asset, environment, unit=unit), "camera", film, seed
-        )
-        self.environment = environment
 
     def render(
         self,
         item: PhotographedObject,
-        photograph: Tensor,
         window: Window,
         model_size: tuple[int, int],
-        *,
         number: int = 0,
-    ) -> Twin:
-        """Render the twins of an object in a photograph.
+    ) -> Layer:
+        """Render the object in a photograph.
 
         Args:
             item: the object; its mesh is that of this renderer.
-            photograph: (H, W, 3) sRGB in [0, 1].
             window: of the photograph.
-            model_size: (height, width) of the images that are returned.
+            model_size: (height, width) of what is visible.
             number: of the row, which has noise of its own.
         """
-        inputs = make_camera_inputs(item, self._asset, window)
-        size = (window.height, window.width)
-        seed = seeds.stream(self._seed, "twin", number)
+        renderer = self._renderer
+        inputs = renderer.scene.assembly(make_camera_inputs(item, self._asset, window))
+        seed = seeds.stream(self._seed, "layer", number)
         with torch.no_grad():
-            scene_inputs = self._hidden.scene.assembly(inputs)
-            rendered = self._hidden.render_radiance(scene_inputs, seed, self._spp, True)
-            sight = self._find_sight(scene_inputs, model_size)
-            surrounded = self._surrounded.render_radiance(
-                self._surrounded.scene.assembly(inputs), seed, self._spp, False
-            )
-            surrounded = self._surrounded.formation.display(surrounded)
-        layer = resize(rendered, size)
-        coverage = layer[..., 3].clamp(0.0, 1.0) * _read_visibility(item, window)
-        crop = cut_window(photograph, window)
-        radiance = layer[..., :3] * self._hidden.formation.gain
-        composed = compose(crop, radiance, layer[..., 3], coverage)
-        around = crop[coverage < 0.5]
-        mean_around = around.mean(dim=0) if len(around) else crop.mean(dim=(0, 1))
-        hole = torch.lerp(crop, mean_around.expand_as(crop), coverage[..., None])
-        covered = coverage >= 0.5
-        difference = (composed - crop)[covered]
-        images = {
-            PHOTOGRAPH: crop,
-            COMPOSED: composed,
-            self.environment: resize(surrounded, size),
-            HOLE: hole,
-        }
-        return Twin(
-            {name: resize(image, model_size) for name, image in images.items()},
-            sight,
-            layer[..., 3].clamp(0.0, 1.0),
-            size=math.sqrt(float(layer[..., 3].clamp(0.0, 1.0).sum())),
-            brightness=float(difference.mean()) if len(difference) else 0.0,
-            contrast=float(around.std()) if len(around) > 1 else 0.0,
+            rendered = renderer.render_radiance(inputs, seed, self._spp, True)
+            surfaces = renderer.scene.find_surfaces(inputs)
+        radiance = rendered[..., :3] * renderer.formation.gain
+        sight = _make_sight(surfaces, self._asset.metres, model_size)
+        return Layer(radiance, rendered[..., 3], sight)
+
+
+class SurroundedRenderer:
+    """Render one object in an environment; arguments as for `LayerRenderer`."""
+
+    def __init__(
+        self,
+        asset: assets.ObjectAsset,
+        unit: str,
+        environment: str,
+        film: tuple[int, int],
+        *,
+        spp: int,
+        seed: int,
+    ) -> None:
+        self._asset = asset
+        self._spp = spp
+        self._seed = seed
+        self._renderer = workbench.load_scene(asset, environment, unit=unit).renderer(
+            "camera", resolution=film, seed=seed
         )
 
-    def _find_sight(
-        self, inputs: Mapping[str, Tensor], model_size: tuple[int, int]
-    ) -> Any:
-        """Return what is visible of the object, as tasks take it."""
-        # imports the tasks
-        from advsearch.extend import tasks
-
-        surfaces = self._hidden.scene.find_surfaces(inputs)
-        metres = self._asset.metres
-
-        def enlarge(values: Tensor) -> Tensor:
-            return F.interpolate(values[None, None].float(), size=model_size)[0, 0]
-
-        return tasks.Sight(
-            enlarge(surfaces.visible_mask(OBJECT)) > 0.5,
-            enlarge(surfaces.depth) * (metres or 1.0),
-            enlarge(surfaces.z_depth) * (metres or 1.0),
-            metres,
-        )
+    def render(
+        self, item: PhotographedObject, window: Window, number: int = 0
+    ) -> Tensor:
+        """Render the object as a photograph shows it, sRGB (h, w, 3) of the film's
+        size; arguments as for `LayerRenderer.render`.
+        """
+        renderer = self._renderer
+        inputs = renderer.scene.assembly(make_camera_inputs(item, self._asset, window))
+        seed = seeds.stream(self._seed, "surrounded", number)
+        with torch.no_grad():
+            radiance = renderer.render_radiance(inputs, seed, self._spp, False)
+            image: Tensor = renderer.formation.display(radiance)
+        return image
 
 
-def _make_renderer(
-    scene: workbench.Scene, controls: Any, film: tuple[int, int], seed: int
-) -> Any:
-    """Return a renderer that is not differentiated, and that records nothing.
+def make_twin(
+    item: PhotographedObject,
+    photograph: Tensor,
+    window: Window,
+    layer: Layer,
+    surrounded: Mapping[str, Tensor],
+    model_size: tuple[int, int],
+) -> Twin:
+    """Lay a render over its photograph, and bring all images to the model's size.
 
-    A recorded render of one scene fails while another with a place lives.
+    Args:
+        item: the object.
+        photograph: (H, W, 3) sRGB in [0, 1].
+        window: of the photograph.
+        layer: render of the object alone.
+        surrounded: sRGB renders by environment.
+        model_size: (height, width) in pixels.
     """
-    loading = workbench.loading
-    description = loading.fit_camera(scene.description, film)
-    return loading.make_renderer(
-        description,
-        loading.make_space(loading.make_controls(controls), description),
-        film,
-        "oidn",
-        seed,
-        leave_out=loading.ALL_OMISSIONS - {"tracing"},
-        differentiated=False,
+    size = (window.height, window.width)
+    alpha = resize(layer.alpha[..., None], size)[..., 0].clamp(0.0, 1.0)
+    coverage = alpha * _read_visibility(item, window)
+    crop = cut_window(photograph, window)
+    composed = compose(crop, resize(layer.radiance, size), alpha, coverage)
+    around = crop[coverage < 0.5]
+    mean_around = around.mean(dim=0) if len(around) else crop.mean(dim=(0, 1))
+    difference = (composed - crop)[coverage >= 0.5]
+    images = {
+        PHOTOGRAPH: crop,
+        COMPOSED: composed,
+        **{name: resize(image, size) for name, image in surrounded.items()},
+        HOLE: torch.lerp(crop, mean_around.expand_as(crop), coverage[..., None]),
+    }
+    return Twin(
+        {name: resize(image, model_size) for name, image in images.items()},
+        layer.sight,
+        alpha,
+        size=math.sqrt(float(alpha.sum())),
+        brightness=float(difference.mean()) if len(difference) else 0.0,
+        contrast=float(around.std()) if len(around) > 1 else 0.0,
+    )
+
+
+def _make_sight(
+    surfaces: Any, metres: float | None, model_size: tuple[int, int]
+) -> Any:
+    """Return what is visible of the object, as tasks take it."""
+    # imports the tasks
+    from advsearch.extend import tasks
+
+    def enlarge(values: Tensor) -> Tensor:
+        return F.interpolate(values[None, None].float(), size=model_size)[0, 0]
+
+    return tasks.Sight(
+        enlarge(surfaces.visible_mask(OBJECT)) > 0.5,
+        enlarge(surfaces.depth) * (metres or 1.0),
+        enlarge(surfaces.z_depth) * (metres or 1.0),
+        metres,
     )
 
 
