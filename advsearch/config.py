@@ -116,7 +116,7 @@ LIST_SETTINGS = (
 """The settings that may be several names, where a command takes several."""
 TEXT_SETTINGS = (
     *LIST_SETTINGS,
-    *("task", "up", "camera", "backdrop", "run", "objective"),
+    *("task", "up", "camera", "backdrop", "occluder", "run", "objective"),
 )
 """The settings that are texts, whatever they are given as."""
 # controls as they are asked for: their names, each with its settings
@@ -237,6 +237,15 @@ class SceneConfig(Config):
         "a picture file, or a part of it, photo.jpg#X,Y,WIDTH,HEIGHT in pixels",
         metavar="FILE",
         otherwise="the environment is behind the object",
+        min_length=1,
+    )
+    occluder: str | None = setting(
+        None,
+        "scene",
+        "a mask of what is before the object in the photograph of `backdrop`",
+        "a picture file of the photograph's size, white where something is before it",
+        metavar="FILE",
+        otherwise="nothing is before the object",
         min_length=1,
     )
     judge: str = setting(

@@ -49,6 +49,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "size": (0, "expected a number of metres from 1e-4 to 1e4, got 0"),
     "things": (3, "expected a text such as 'car@12,3.5', a mapping or a list of these, got 3"),
     "backdrop": ("", "expected a picture file, or a part of it, photo.jpg#X,Y,WIDTH,HEIGHT in pixels, got ''"),
+    "occluder": ("", "expected a picture file of the photograph's size, white where something is before it, got ''"),
     "judge": ("", "expected object, the name of a thing beside it, or all, got ''"),
     "unit": ("ft", "expected mm, cm, m or in, got ft"),
     "facing": ("ahead", "expected +x, -x, +y, -y, +z or -z, got ahead"),
@@ -117,6 +118,7 @@ WRONG: dict[str, tuple[Any, str]] = {
 GIVEN: dict[str, Any] = {
     "object": "mug.obj", "environment": "room.hdr", "up": "y", "facing": "-z", "size": 4.9, "unit": "cm",
     "camera": "front", "things": "car@1,2", "judge": "car", "backdrop": "desk.jpg#1,2,30,40",
+    "occluder": "hand.png",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
     "labels": "labels.json", "prompt": "a photo of a {}", "ask": {"calls": 5.0}, "task": "detection",

@@ -58,6 +58,7 @@ class SceneKeywords(TypedDict, total=False):
     set: Mapping[str, float | str | Sequence[float]] | None
     things: str | Path | None
     backdrop: str | Path | None
+    occluder: str | Path | None
     judge: str | Path
     exposure: float
     resolution: int | str | tuple[int, int] | None

@@ -67,6 +67,9 @@ or its instance, and ``mitsuba:KEY`` a range.
 
 Texture = str | Path | npt.ArrayLike | Tensor
 
+PHOTOGRAPH_SETTINGS = ("ground.level", "backdrop.noise", "backdrop.blur")
+"""Settings that only a scene has which is rendered into a photograph."""
+
 SINGLE_VALUE_KEYS = {"distribution", "choices", "range"}
 """A mapping with one of these keys describes one value, and not the settings of a
 control.
@@ -228,6 +231,7 @@ def load_scene(
     | Sequence[str | Mapping[str, object]]
     | None = None,
     backdrop: str | Path | BackdropPhotograph | None = None,
+    occluder: str | Path | None = None,
 ) -> Scene:
     """Load a scene.
 
@@ -266,6 +270,8 @@ def load_scene(
         backdrop: a photograph that the scene is rendered into (docs/cameras.md): a
             picture file, taken by `camera`; of a part of it,
             ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels.
+        occluder: a mask of the photograph's size, white where it shows what is before
+            the object.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of
@@ -294,13 +300,29 @@ def load_scene(
     if camera is not None:
         description = description.with_camera(camera)
     if backdrop is not None:
-        description = description.with_backdrop(backdrop)
+        description = description.with_backdrop(backdrop, occluder)
+    else:
+        _check_no_photograph(fixed_values or {}, occluder)
     has_asset = any(
         asset is not None and not isinstance(asset, (str, Path))
         for asset in (object, environment, backdrop)
     )
     loaded = Scene(description, is_session_only=mitsuba_dict is not None or has_asset)
     return loaded if texture is None else loaded.with_texture(texture)
+
+
+def _check_no_photograph(
+    fixed_values: SettingValues, occluder: str | Path | None
+) -> None:
+    """Raise InputError for what says something of a photograph where there is none."""
+    stated = [name for name in fixed_values if name in PHOTOGRAPH_SETTINGS]
+    if occluder is not None:
+        stated.append("occluder")
+    if stated:
+        raise InputError(
+            f"{stated[0]}: is about a photograph that the scene is rendered into, and "
+            "there is none; give a `backdrop`, or leave it out"
+        )
 
 
 def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
@@ -348,6 +370,7 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
         "camera": _camera_setting(description),
         "things": description.things_spec or None,
         "backdrop": photograph.spec if photograph is not None else None,
+        "occluder": (photograph.front_spec or None) if photograph is not None else None,
         "set": description.requested_values,
     }
 

@@ -67,7 +67,7 @@ def load_configured_scene(
 
 def make_scene_kwargs(config: SceneConfig) -> dict[str, Any]:
     """Return the keyword arguments of `load_scene` that a configuration states."""
-    names = ("up", "facing", "size", "unit", "camera", "things", "backdrop")
+    names = ("up", "facing", "size", "unit", "camera", "things", "backdrop", "occluder")
     return {
         **{name: getattr(config, name) for name in names},
         "settings": collect_scene_parameters(config),
@@ -278,6 +278,7 @@ SCENE_SETTINGS = (
     "camera",
     "things",
     "backdrop",
+    "occluder",
     "exposure",
     "object",
 )

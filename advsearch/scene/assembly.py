@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.assets import Float32Array, IntArray, Mesh, Shape
-from advsearch.scene.backdrop import compute_plane_radiance
+from advsearch.scene.backdrop import make_image_inputs
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import (
@@ -36,7 +36,16 @@ from advsearch.scene.gradients import Group
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart
 
 # inputs that the renderer applies to radiance
-IMAGE_INPUTS = frozenset({"backdrop.color", "backdrop.plane", "camera.exposure"})
+IMAGE_INPUTS = frozenset(
+    {
+        "backdrop.blur",
+        "backdrop.color",
+        "backdrop.front",
+        "backdrop.noise",
+        "backdrop.plane",
+        "camera.exposure",
+    }
+)
 
 
 class MovingMesh:
@@ -177,11 +186,9 @@ class Assembly:
             if isinstance(part, (BeamLamp, LampGlass))
         ]
         self._photograph = description.photograph
-        self._backdrop: Tensor | None = None
-        self._plane_radiance: Tensor | None = None
-        if description.backdrop_photograph is not None and resolution is not None:
-            self._backdrop = description.backdrop_photograph.resample(resolution)
-            self._plane_radiance = compute_plane_radiance(description)
+        self._image_inputs: dict[str, Tensor] = {}
+        if resolution is not None:
+            self._image_inputs = make_image_inputs(description, resolution)
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps applied.
@@ -193,11 +200,7 @@ class Assembly:
             pose = inputs.get(name, self.meshes[OBJECT].to_world).clone()
             pose[1, 3] += HIDDEN_OFFSET
             inputs = {**inputs, name: pose}
-        parameters = dict(inputs)
-        if self._backdrop is not None:
-            parameters["backdrop.color"] = self._backdrop
-        if self._plane_radiance is not None:
-            parameters["backdrop.plane"] = self._plane_radiance
+        parameters = {**inputs, **self._image_inputs}
         for part in self._carried:  # what carries it may be moved or deformed
             parameters |= _move_carried(part, inputs)
         for name, mesh in self.meshes.items():

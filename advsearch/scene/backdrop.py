@@ -33,7 +33,7 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from advsearch.errors import FileFormatError, InputError
-from advsearch.pictures import check_decodable, opened, steps_of
+from advsearch.pictures import check_decodable, open_image, to_8bit_levels
 from advsearch.scene.assets import Float32Array, Float64Array, ObjectAsset
 from advsearch.scene.camera_model import (
     BROWN_CONRADY,
@@ -46,8 +46,9 @@ from advsearch.scene.camera_model import (
 )
 from advsearch.scene.color import CHANNELS, linear_to_srgb, srgb_to_linear
 from advsearch.scene.geometry import camera_to_world, object_to_world, project_points
+from advsearch.scene.image_quality import make_noise, measure_blur, measure_noise
 from advsearch.scene.importing.pictures import average_area
-from advsearch.trust.stored_files import LARGEST_FILE, reading
+from advsearch.trust.stored_files import LARGEST_FILE, track_opened_files
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -63,10 +64,11 @@ PHOTOGRAPH_CAMERA = "photograph"  # name of the pinhole of a part of a photograp
 PLANE_SETTINGS = frozenset(
     ("ground.size", "ground.level", *(f"ground.{channel}" for channel in CHANNELS))
 )
+MIN_BLUR = 0.15  # pixels; less is not seen
 PLANE_SIZE = 12.0  # side of the plane, object sizes
-# mean reflectance of what photographs show (Buchsbaum 1980, A spatial processor model
-# for object colour perception), which gives the exposure, and the plane its albedo
-GREY_WORLD = 0.3
+# mean reflectance of what photographs show, that of the grey card to which cameras
+# meter: it gives the exposure
+GREY_CARD = 0.18
 ALBEDO_RANGE = (0.05, 0.8)  # of the plane
 # radii around the object, in object sizes, between which the plane's color is measured
 CONTACT_RING = (0.5, 1.5)
@@ -83,6 +85,10 @@ class BackdropPhotograph:
     levels: npt.NDArray[np.uint8]  # (H, W, 3) sRGB of the full photograph
     digest: str  # SHA-256 of the levels, in hexadecimal
     crop: tuple[int, int, int, int]  # left, top, width and height in pixels
+    # (H, W) levels: 255 where the photograph shows what is before the object; None if
+    # nothing is
+    front: npt.NDArray[np.uint8] | None = None
+    front_spec: str = ""  # how that was asked for
 
     @property
     def full_size(self) -> tuple[int, int]:
@@ -107,23 +113,62 @@ class BackdropPhotograph:
         Returns:
             (H, W, 3) float32 in [0, 1].
         """
-        left, top, width, height = self.crop
-        levels = self.levels[top : top + height, left : left + width]
         decoded = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
-        linear: Float32Array = decoded[levels]
-        averaged = average_area(
-            linear, min(height, resolution[0]), min(width, resolution[1])
-        )
-        image = torch.from_numpy(averaged)
-        if tuple(averaged.shape[:2]) == resolution:
-            return image
-        enlarged = torch.nn.functional.interpolate(
-            image.permute(2, 0, 1)[None],
-            size=resolution,
-            mode="bilinear",
-            align_corners=False,
-        )
-        return enlarged[0].permute(1, 2, 0).contiguous()
+        return self._resample_part(decoded[self.levels], resolution)
+
+    def resample_front(self, resolution: tuple[int, int]) -> Tensor | None:
+        """Return what is before the object, (H, W, 1) float32 in [0, 1], or None."""
+        if self.front is None:
+            return None
+        fractions = self.front[..., None].astype(np.float32) / np.float32(255.0)
+        return self._resample_part(fractions, resolution)
+
+    def make_noise(self, resolution: tuple[int, int], sigma: float | None) -> Tensor:
+        """Return noise (H, W, 3) float32, display-referred, as the photograph has.
+
+        It is made in the pixels of the photograph and resampled as that is, so that it
+        is as coarse. The same photograph gives the same noise.
+
+        Args:
+            resolution: height and width in pixels.
+            sigma: standard deviation in levels at that resolution; None: that of the
+                photograph.
+        """
+        part = self.levels[
+            self.crop[1] : self.crop[1] + self.crop[3],
+            self.crop[0] : self.crop[0] + self.crop[2],
+        ]
+        seed = int(self.digest[:8], 16)
+        if sigma is not None:
+            return make_noise(np.full(3, sigma / 255.0), resolution, seed)
+        noise = make_noise(measure_noise(part) / 255.0, self.size, seed)
+        return _resample_image(noise.numpy(), resolution)
+
+    def _resample_part(
+        self, image: Float32Array, resolution: tuple[int, int]
+    ) -> Tensor:
+        """Return the used part of an image (H, W, C) at (height, width) pixels."""
+        left, top, width, height = self.crop
+        part = image[top : top + height, left : left + width]
+        return _resample_image(part, resolution)
+
+
+def _resample_image(image: Float32Array, resolution: tuple[int, int]) -> Tensor:
+    """Average an image (H, W, C) down to (height, width) pixels, or interpolate it."""
+    height, width = image.shape[:2]
+    averaged = average_area(
+        image, min(height, resolution[0]), min(width, resolution[1])
+    )
+    resampled = torch.from_numpy(averaged)
+    if tuple(averaged.shape[:2]) == resolution:
+        return resampled
+    enlarged = torch.nn.functional.interpolate(
+        resampled.permute(2, 0, 1)[None],
+        size=resolution,
+        mode="bilinear",
+        align_corners=False,
+    )
+    return enlarged[0].permute(1, 2, 0).contiguous()
 
 
 def read_backdrop(spec: str | Path) -> BackdropPhotograph:
@@ -140,7 +185,7 @@ def read_backdrop(spec: str | Path) -> BackdropPhotograph:
     text = str(spec)
     part = CROP.fullmatch(text)
     path = Path(part["path"] if part else text)
-    with reading(path), opened(path, LARGEST_FILE) as image:
+    with track_opened_files(path), open_image(path, LARGEST_FILE) as image:
         levels = _decode_photograph(image, path)
     height, width = levels.shape[:2]
     crop = (0, 0, width, height)
@@ -160,6 +205,63 @@ def read_backdrop(spec: str | Path) -> BackdropPhotograph:
     return make_backdrop(levels, text, crop)
 
 
+def with_front(photograph: BackdropPhotograph, spec: str | Path) -> BackdropPhotograph:
+    """Return a photograph with the mask of what is before the object.
+
+    Args:
+        photograph: the photograph.
+        spec: a picture file of the full photograph's size, white where something is
+            before the object, black elsewhere.
+
+    Raises:
+        FileFormatError: the file cannot be used.
+        InputError: it has another size.
+    """
+    path = Path(spec)
+    with track_opened_files(path), open_image(path, LARGEST_FILE) as image:
+        levels = _decode_photograph(image, path)
+    if levels.shape != photograph.levels.shape:
+        height, width = photograph.full_size
+        raise InputError(
+            f"occluder: expected a mask of {width} x {height} pixels (width x height), "
+            f"as the photograph has, got {levels.shape[1]} x {levels.shape[0]} in "
+            f"{spec}"
+        )
+    front = np.ascontiguousarray(levels[..., 1])
+    return replace(photograph, front=front, front_spec=str(spec))
+
+
+def make_image_inputs(
+    description: SceneDescription, resolution: tuple[int, int]
+) -> dict[str, Tensor]:
+    """Return the inputs by which a rendered image becomes a part of its photograph.
+
+    Empty for a scene that is rendered into none.
+
+    Returns:
+        ``backdrop.color`` (H, W, 3) the photograph; and if there is any
+        ``backdrop.plane`` (3,), see `compute_plane_radiance`; ``backdrop.front`` (H, W,
+        1) what is before the object; ``backdrop.noise`` (H, W, 3) display-referred
+        noise, and ``backdrop.blur`` (1,) in pixels, of what is rendered.
+    """
+    photograph = description.backdrop_photograph
+    if photograph is None:
+        return {}
+    color = photograph.resample(resolution)
+    blur = description.values.get("backdrop.blur")
+    if blur is None:
+        blur = measure_blur((color.numpy() * LUMINANCE).sum(axis=-1, dtype=np.float32))
+    noise = photograph.make_noise(resolution, description.values.get("backdrop.noise"))
+    inputs: dict[str, Tensor | None] = {
+        "backdrop.color": color,
+        "backdrop.plane": compute_plane_radiance(description),
+        "backdrop.front": photograph.resample_front(resolution),
+        "backdrop.noise": noise if bool(noise.any()) else None,
+        "backdrop.blur": torch.tensor([blur]) if blur >= MIN_BLUR else None,
+    }
+    return {name: value for name, value in inputs.items() if value is not None}
+
+
 def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:
     """Return the levels (H, W, 3) of an opened photograph, as a viewer shows it."""
     check_decodable(image, path)
@@ -168,13 +270,13 @@ def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:
         image.load()
         upright = ImageOps.exif_transpose(image)
     if image.has_transparency_data and bool(
-        (steps_of(upright, alpha=True)[:, :, 3] < 255).any()
+        (to_8bit_levels(upright, alpha=True)[:, :, 3] < 255).any()
     ):
         raise FileFormatError(
             f"{path}: expected a photograph, got a picture that is transparent in some "
             "pixels; save it without transparency"
         )
-    return np.ascontiguousarray(steps_of(upright, alpha=False))
+    return np.ascontiguousarray(to_8bit_levels(upright, alpha=False))
 
 
 def make_backdrop(
@@ -224,7 +326,7 @@ def compute_photograph_gain(
     decoded = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
     means = np.array([np.average(decoded, weights=count) for count in counts])
     mean = max(float(means @ LUMINANCE), 1e-3)
-    return mean * math.pi / (GREY_WORLD * irradiance)
+    return mean * math.pi / (GREY_CARD * irradiance)
 
 
 def compute_level_irradiance(description: SceneDescription) -> Float64Array:
@@ -288,19 +390,36 @@ def measure_plane_color(
     names = [f"ground.{channel}" for channel in CHANNELS]
     if not has_plane(description) or description.requested & set(names):
         return {}
-    height, width = photograph.full_size
+    levels = _look_up_levels(description, photograph, _sample_ring(description))
+    if not len(levels):
+        return {}
+    display = levels.astype(np.float32) / np.float32(255.0)
+    light = description.gain * compute_level_irradiance(description) / math.pi
+    albedo = np.median(srgb_to_linear(display), axis=0) / light
+    color = linear_to_srgb(np.clip(albedo, *ALBEDO_RANGE).astype(np.float32))
+    return dict(zip(names, map(float, color), strict=True))
+
+
+def _sample_ring(description: SceneDescription) -> Float64Array:
+    """Return points (N, 3) of the plane around the object."""
     rng = np.random.default_rng(0)
     angle = rng.uniform(0.0, 2.0 * math.pi, N_CONTACT_POINTS)
     radius = rng.uniform(*CONTACT_RING, N_CONTACT_POINTS)
     center = object_to_world(description)[:2, 3]
+    x = center[0] + radius * np.cos(angle)
+    y = center[1] + radius * np.sin(angle)
     level = np.full(N_CONTACT_POINTS, description.number("ground.level"))
-    points = np.column_stack(
-        [
-            center[0] + radius * np.cos(angle),
-            center[1] + radius * np.sin(angle),
-            level,
-        ]
-    )
+    return np.column_stack([x, y, level])
+
+
+def _look_up_levels(
+    description: SceneDescription, photograph: BackdropPhotograph, points: Float64Array
+) -> npt.NDArray[np.uint8]:
+    """Return the levels (M, 3) of a photograph at those of points (N, 3) that it shows.
+
+    The scene has the camera of the full photograph.
+    """
+    height, width = photograph.full_size
     camera = camera_to_world(description, width / height)
     relative = (points - camera[:3, 3]) @ camera[:3, :3]
     positions, is_visible = project_points(
@@ -309,17 +428,11 @@ def measure_plane_color(
         torch.from_numpy(relative),
         (height, width),
     )
-    pixels = np.floor(positions.numpy() + np.array([width, height]) / 2.0).astype(int)
-    is_inside = is_visible.numpy() & (pixels >= 0).all(axis=1)
-    is_inside &= (pixels < np.array([width, height])).all(axis=1)
-    if not is_inside.any():
-        return {}
-    levels = photograph.levels[pixels[is_inside, 1], pixels[is_inside, 0]]
-    display = levels.astype(np.float32) / np.float32(255.0)
-    light = description.gain * compute_level_irradiance(description) / math.pi
-    albedo = np.median(srgb_to_linear(display), axis=0) / light
-    color = linear_to_srgb(np.clip(albedo, *ALBEDO_RANGE).astype(np.float32))
-    return dict(zip(names, map(float, color), strict=True))
+    size = np.array([width, height])
+    pixels = np.floor(positions.numpy() + size / 2.0).astype(int)
+    is_inside = is_visible.numpy() & ((pixels >= 0) & (pixels < size)).all(axis=1)
+    inside: npt.NDArray[np.intp] = pixels[is_inside]
+    return photograph.levels[inside[:, 1], inside[:, 0]]
 
 
 # ---- The camera of a photograph

@@ -38,6 +38,7 @@ from advsearch.scene.backdrop import (
     compute_view_settings,
     make_matrix_camera,
     read_backdrop,
+    with_front,
 )
 from advsearch.scene.camera_entries import (
     MAX_TABLETOP_SIZE,
@@ -191,7 +192,9 @@ class SceneDescription:
         return with_requested_ground(self.with_values(ground__size=0.0))
 
     def with_backdrop(
-        self, photograph: str | Path | BackdropPhotograph
+        self,
+        photograph: str | Path | BackdropPhotograph,
+        occluder: str | Path | None = None,
     ) -> SceneDescription:
         """Return the scene as it is rendered into a photograph.
 
@@ -201,6 +204,8 @@ class SceneDescription:
         Args:
             photograph: a picture file; with the part to use behind its name,
                 ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels from the top left corner.
+            occluder: a mask of the photograph's size, white where it shows what is
+                before the object.
 
         Raises:
             FileFormatError: the file can not be used.
@@ -209,6 +214,8 @@ class SceneDescription:
         """
         if not isinstance(photograph, BackdropPhotograph):
             photograph = read_backdrop(photograph)
+        if occluder is not None:
+            photograph = with_front(photograph, occluder)
         others = sorted(
             name
             for name in self.requested - PLANE_SETTINGS

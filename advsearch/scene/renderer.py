@@ -43,6 +43,7 @@ from advsearch.scene.gradients import (
     forbid_second_derivatives,
     make_first_plan,
 )
+from advsearch.scene.image_quality import blur_image
 from advsearch.scene.mitsuba_backend.denoise import denoise_image
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.rig import Mount
@@ -342,6 +343,11 @@ class Renderer:
             surfaces = self.scene.find_surfaces(
                 _select_scene_inputs(inputs), subdivision
             )
+            if "backdrop.front" in inputs:
+                is_hidden = inputs["backdrop.front"][..., 0] > 0.5
+                for dim in (0, 1):
+                    is_hidden = is_hidden.repeat_interleave(subdivision, dim)
+                surfaces.id[is_hidden] = 0
         metres = self.scene.definition[0].metres
         return replace(
             surfaces, depth=surfaces.depth * metres, z_depth=surfaces.z_depth * metres
@@ -546,18 +552,44 @@ class Renderer:
         """
         exposure = inputs.get("camera.exposure")
         backdrop = inputs.get("backdrop.color")
+        if "backdrop.blur" in inputs:
+            rendered = blur_image(rendered, float(inputs["backdrop.blur"]))
         radiance = rendered[..., :3]
         if exposure is not None:
             radiance = radiance * torch.exp2(exposure)
         if backdrop is not None:
-            shade = (1.0 - rendered[..., 3:4]).clamp(0.0, 1.0)
-            if "backdrop.plane" in inputs:
-                change = rendered[..., 4:] / inputs["backdrop.plane"]
-                shade = (shade + change).clamp_min(0.0)
-            radiance = radiance + shade * (backdrop / self.formation.gain)
+            radiance = self._compose(radiance, rendered, inputs)
         if not display:
             return radiance
-        return self.space.apply_to_image(u, self.formation.display(radiance))
+        image = self.formation.display(radiance)
+        if "backdrop.noise" in inputs:
+            coverage = rendered[..., 3:4].detach()
+            if "backdrop.front" in inputs:
+                coverage = coverage * (1.0 - inputs["backdrop.front"])
+            image = (image + coverage * inputs["backdrop.noise"]).clamp(0.0, 1.0)
+        return self.space.apply_to_image(u, image)
+
+    def _compose(
+        self, radiance: Tensor, rendered: Tensor, inputs: Mapping[str, Tensor]
+    ) -> Tensor:
+        """Return radiance (H, W, 3) over its backdrop, see `advsearch.scene.backdrop`.
+
+        Args:
+            radiance: times its coverage.
+            rendered: the same with coverage and change of the plane.
+            inputs: of the scene.
+        """
+        behind = inputs["backdrop.color"] / self.formation.gain
+        shade = (1.0 - rendered[..., 3:4]).clamp(0.0, 1.0)
+        if "backdrop.plane" in inputs:
+            change = rendered[..., 4:] / inputs["backdrop.plane"]
+            shade = (shade + change).clamp_min(0.0)
+        composed = radiance + shade * behind
+        if "backdrop.front" not in inputs:
+            return composed
+        return torch.lerp(
+            composed, behind.expand_as(composed), inputs["backdrop.front"]
+        )
 
     def render_radiance(
         self,

@@ -542,6 +542,29 @@ MATERIAL = (
     ),
     _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
 )
+# how what is rendered into a photograph is made to look like the rest of it
+BACKDROP = (
+    Parameter(
+        "noise",
+        (),
+        "levels of 255",
+        0.0,
+        100.0,
+        "as the photograph has",
+        "Noise of what is rendered into a photograph (`backdrop`).",
+        estimators=(),
+    ),
+    Parameter(
+        "blur",
+        (),
+        "pixels",
+        0.0,
+        20.0,
+        "as the photograph has",
+        "Blur of what is rendered into a photograph, a standard deviation.",
+        estimators=(),
+    ),
+)
 FAMILIES = {
     "camera": (
         *CAMERA,
@@ -552,6 +575,7 @@ FAMILIES = {
     "pose": POSE,
     "environment": ENVIRONMENT,
     "ground": GROUND,
+    "backdrop": BACKDROP,
     "material": MATERIAL,
     "object": (_lamps("the object, a car"),),
 }

@@ -78,6 +78,7 @@ SCENE_SETTINGS = (
     "camera",
     "things",
     "backdrop",
+    "occluder",
     "set_",
     "exposure",
 )

@@ -273,8 +273,10 @@ def _get_box(info: Mapping[str, Any]) -> tuple[float, float, float, float] | Non
 
 def _read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file with an entry for each image."""
-    text = stored_files.present_text(path, "a JSON file of a scene", MAX_JSON_BYTES)
-    content = stored_files.parsed(path, text, "JSON", stored_files.parse_json)
+    text = stored_files.read_existing_text(
+        path, "a JSON file of a scene", MAX_JSON_BYTES
+    )
+    content = stored_files.parse_text(path, text, "JSON", stored_files.parse_json)
     if not isinstance(content, dict):
         raise errors.FileFormatError(f"{path}: expected an object with the images")
     return content
@@ -296,20 +298,26 @@ def _read_list(path: Path) -> Iterator[PhotographedObject]:
 def _read_rows(path: Path) -> list[dict[str, Any]]:
     """Read a list as mappings; those of CSV have texts."""
     if path.suffix.lower() == ".csv":
-        text = stored_files.present_text(path, "a list of photographs", MAX_JSON_BYTES)
+        text = stored_files.read_existing_text(
+            path, "a list of photographs", MAX_JSON_BYTES
+        )
         rows: Any = [
             {key: value for key, value in row.items() if value}
             for row in csv.DictReader(io.StringIO(text))
         ]
     elif path.suffix.lower() == ".json":
-        text = stored_files.present_text(path, "a list of photographs", MAX_JSON_BYTES)
-        rows = stored_files.parsed(path, text, "JSON", stored_files.parse_json)
+        text = stored_files.read_existing_text(
+            path, "a list of photographs", MAX_JSON_BYTES
+        )
+        rows = stored_files.parse_text(path, text, "JSON", stored_files.parse_json)
     else:
         # imports torch
         from advsearch.extend import workbench
 
-        text = stored_files.present_text(path, "a list of photographs", MAX_YAML_BYTES)
-        rows = stored_files.parsed(path, text, "YAML", workbench.parse_yaml)
+        text = stored_files.read_existing_text(
+            path, "a list of photographs", MAX_YAML_BYTES
+        )
+        rows = stored_files.parse_text(path, text, "YAML", workbench.parse_yaml)
     if isinstance(rows, dict):
         rows = rows.get("photographs")
     if not _is_rows(rows):

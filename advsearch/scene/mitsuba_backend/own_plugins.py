@@ -370,6 +370,74 @@ def _make_event(ray: Any, si: Any, scattered: Any, distance: Any) -> Any:
 mi.register_integrator("advsearch_haze", lambda props: HazePath(props))
 
 
+class _PlaneHits:
+    """Camera rays that meet the plane first, and where their paths go on.
+
+    Args:
+        scene, sampler: as in `mi.ad.integrators.common.RBIntegrator`.
+        ray: camera rays.
+        active: which are traced at all.
+
+    Attributes:
+        is_hit: whether a ray meets the plane first.
+        direct_change: of its radiance by what hides the environment, and by lamps.
+        weight: of the light that comes along the path's next segment.
+        path_ray: that segment; of other rays, the camera ray.
+        is_traced: whether there is such a segment.
+    """
+
+    def __init__(self, scene: Any, sampler: Any, ray: Any, active: Any) -> None:
+        plane = next(shape for shape in scene.shapes() if shape.id() == PLANE_SHAPE)
+        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        self.is_hit = active & hit.is_valid() & (hit.shape == mi.ShapePtr(plane))
+        self._si = hit.compute_surface_interaction(ray, mi.RayFlags.All, self.is_hit)
+        light = self._sample_emitter(scene, sampler)
+        self.direct_change = dr.select(self.is_hit, self._factor * light, 0.0)
+        bounce, self.weight = self._si.bsdf().sample(
+            mi.BSDFContext(),
+            self._si,
+            sampler.next_1d(),
+            sampler.next_2d(),
+            self.is_hit,
+        )
+        bounced_ray = self._si.spawn_ray(self._si.to_world(bounce.wo))
+        self.path_ray = dr.select(self.is_hit, bounced_ray, ray)
+        self.is_traced = active & (~self.is_hit | (bounce.pdf > 0.0))
+
+    def _sample_emitter(self, scene: Any, sampler: Any) -> Any:
+        """Sample an emitter, and return its radiance over the density.
+
+        The factor by which that changes the plane is stored: what the plane reflects of
+        it, with -1 for the environment where something is in between, and 0 where
+        nothing is; for lamps it is the other way around, 0 and 1.
+        """
+        si = self._si
+        ds, light = scene.sample_emitter_direction(
+            si, sampler.next_2d(), False, self.is_hit
+        )
+        is_sampled = self.is_hit & (ds.pdf != 0.0)
+        is_blocked = scene.ray_test(si.spawn_ray_to(ds.p), is_sampled)
+        is_environment = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        sign = dr.select(is_blocked, 0.0, 1.0)
+        sign = dr.select(is_environment, sign - 1.0, sign)
+        reflected = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(ds.d), is_sampled)
+        self._emitter_sample = ds
+        self._factor = dr.select(is_sampled, sign * reflected, 0.0)
+        return light
+
+    def backpropagate(self, scene: Any, cotangent: Any) -> None:
+        """Add the derivative of `cotangent * direct_change` by lights."""
+        ds = self._emitter_sample
+        is_sampled = self.is_hit & (ds.pdf != 0.0)
+        with dr.resume_grad():
+            light = scene.eval_emitter_direction(self._si, ds, is_sampled)
+            light *= dr.select(is_sampled, dr.rcp(ds.pdf), 0.0)
+            if dr.grad_enabled(light):
+                # The path goes along the same edges later: they are kept.
+                change = cotangent * self._factor * light
+                dr.backward_from(change, dr.ADFlag.ClearInterior)
+
+
 class PhotographPath(PRBIntegrator):  # type: ignore[misc]
     """Trace paths for a scene that is rendered into a photograph, with an adjoint.
 
@@ -400,57 +468,24 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
         **rest: Any,
     ) -> Any:
         """Sample paths, or replay them; see `mi.ad.integrators.common.RBIntegrator`."""
-        ray = mi.Ray3f(dr.detach(ray))
-        active = mi.Bool(active)
-        plane = next(shape for shape in scene.shapes() if shape.id() == PLANE_SHAPE)
-        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        on_plane = active & hit.is_valid() & (hit.shape == mi.ShapePtr(plane))
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, on_plane)
-        bsdf = si.bsdf()
-        context = mi.BSDFContext()
-
-        ds, light = scene.sample_emitter_direction(
-            si, sampler.next_2d(), False, on_plane
-        )
-        is_sampled = on_plane & (ds.pdf != 0.0)
-        is_blocked = scene.ray_test(si.spawn_ray_to(ds.p), is_sampled)
-        is_environment = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        factor = dr.select(
-            is_environment,
-            dr.select(is_blocked, -1.0, 0.0),
-            dr.select(is_blocked, 0.0, 1.0),
-        )
-        reflected = bsdf.eval(context, si, si.to_local(ds.d), is_sampled)
-        reflected *= dr.select(is_sampled, factor, 0.0)
-
-        bounce, weight = bsdf.sample(
-            context, si, sampler.next_1d(), sampler.next_2d(), on_plane
-        )
-        bounced = si.spawn_ray(si.to_world(bounce.wo))
-        path_ray = dr.select(on_plane, bounced, ray)
-        is_traced = active & (~on_plane | (bounce.pdf > 0.0))
+        plane = _PlaneHits(scene, sampler, mi.Ray3f(dr.detach(ray)), mi.Bool(active))
         if mode != dr.ADMode.Primal:
             change = mi.Spectrum(*δaovs)
-            δL = dr.select(on_plane, weight * change, δL)
-            with dr.resume_grad():
-                attached = scene.eval_emitter_direction(si, ds, is_sampled)
-                attached *= reflected * dr.select(is_sampled, dr.rcp(ds.pdf), 0.0)
-                if dr.grad_enabled(attached):
-                    # The path goes along the same edges later: they are kept.
-                    dr.backward_from(change * attached, dr.ADFlag.ClearInterior)
+            plane.backpropagate(scene, change)
+            δL = dr.select(plane.is_hit, plane.weight * change, δL)
         L, valid, _, state_out = super().sample(
             mode=mode,
             scene=scene,
             sampler=sampler,
-            ray=path_ray,
+            ray=plane.path_ray,
             δL=δL,
             state_in=state_in,
-            active=is_traced,
+            active=plane.is_traced,
             **rest,
         )
-        arrived = dr.select(on_plane, weight * L + reflected * light, 0.0)
-        color = dr.select(on_plane, 0.0, L)
-        return color, valid & ~on_plane, [*arrived], state_out
+        change = dr.select(plane.is_hit, plane.weight * L + plane.direct_change, 0.0)
+        color = dr.select(plane.is_hit, 0.0, L)
+        return color, valid & ~plane.is_hit, [*change], state_out
 
     def sample_rays(self, scene: Any, sensor: Any, sampler: Any, **rest: Any) -> Any:
         """Return rays, weights and positions, with weights that are plain numbers.

@@ -113,9 +113,7 @@ def collect_paths(
     """
     ray, weight = _sample_camera_rays(scene.sensors()[0], noise, size, spp)
     if unseen is not None:
-        hit = scene.ray_intersect_preliminary(ray, coherent=True)
-        is_unseen = hit.is_valid() & (hit.shape == mi.ShapePtr(unseen))
-        weight = dr.select(is_unseen, 0.0, weight)
+        weight = dr.select(_find_hits(scene, ray, unseen), 0.0, weight)
     first_hit, emitted, bounces = _trace_paths(scene, ray, weight, noise, depth)
 
     # The BSDFs are evaluated once more with the base color larger by `COLOR_STEP`:
@@ -146,6 +144,12 @@ def collect_paths(
     L = dr.select(dr.isfinite(L), L, 0.0)
     channels = [*(L + emitted[0]), *first_hit]
     return _fetch_paths(channels, vertices, size, spp)
+
+
+def _find_hits(scene: Any, ray: Any, shape: Any) -> Any:
+    """Return which rays meet one of Mitsuba's shapes first."""
+    hit = scene.ray_intersect_preliminary(ray, coherent=True)
+    return hit.is_valid() & (hit.shape == mi.ShapePtr(shape))
 
 
 def _sample_camera_rays(

@@ -550,9 +550,7 @@ def _collect(
             transport.finish(smooth)
         if hide:
             base = torch.cat([base, paths.coverage], dim=-1)
-        if "backdrop.plane" in applied:  # the plane's change stays as it is there
-            traced_image = renderer.render_radiance(traced, seed, spp, hide)
-            base = torch.cat([base, traced_image[..., 4:]], dim=-1)
+            base = _append_plane_change(renderer, base, traced, seed, spp)
     return LinearizedScene(
         transports=transports,
         linearized_at=linearized_at,
@@ -560,6 +558,19 @@ def _collect(
         base_image=PackedImage(base, is_small=quick),
         non_finite=renderer.non_finite - non_finite_before,
     )
+
+
+def _append_plane_change(
+    renderer: Renderer, base: Tensor, traced: Inputs, seed: int, spp: int
+) -> Tensor:
+    """Return a base image with the change of the plane that takes the shadow.
+
+    It stays as it is there. Without such a plane the image stays as it is.
+    """
+    if renderer.scene.plane_radiance is None:
+        return base
+    image = renderer.render_radiance(traced, seed, spp, True)
+    return torch.cat([base, image[..., 4:]], dim=-1)
 
 
 def _fill_transports(
