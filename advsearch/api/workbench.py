@@ -111,7 +111,6 @@ from advsearch.runs.results import AxisValue as AxisValue
 from advsearch.runs.store import Row as Row
 from advsearch.runs.summary import read_configuration as read_configuration
 from advsearch.runs.tables import read_units as read_units
-from advsearch.runs.tables import units_of as units_of
 from advsearch.runs.twins import find_twin_evidence as find_twin_evidence
 from advsearch.runs.twins import read_twins as read_twins
 from advsearch.scene import library as library
@@ -133,7 +132,6 @@ from advsearch.threads import count_cores as count_cores
 from advsearch.trust.code import allow_named as allow_named
 from advsearch.trust.programs import find_blender as find_blender
 from advsearch.trust.programs import make_environment as make_environment
-from advsearch.trust.programs import surroundings as surroundings
 from advsearch.trust.yaml_text import parse_yaml as parse_yaml
 
 
