@@ -25,7 +25,7 @@ from advsearch.report import wording
 from advsearch.report.views import get_view, list_remarks
 from advsearch.runs import twins as runs_twins
 from advsearch.runs.results import IN_PHOTOGRAPH, WITHOUT_OBJECT, Estimate, TwinAgreement, TwinEvidence, TwinMatch
-from small_models import SMALL_ATTACK
+from small_models import SMALL_ATTACK, Finder
 
 PHOTOGRAPHS = Path(__file__).resolve().parents[2] / "scenes" / "photographs"
 SCENE = PHOTOGRAPHS / "test" / "000001"
@@ -78,6 +78,19 @@ def test_the_table_counts_pairs_by_surroundings_and_condition(compared: TwinsRes
     dim = [row for row in compared.table if row.condition == "dim"]
     assert {row.pairs for row in dim} == {4}
     assert all(len(pair.pictures) == 3 for pair in compared.pairs)
+
+
+@pytest.mark.medium
+def test_a_detector_is_judged_by_the_box_of_the_pose(tmp_path: Path) -> None:
+    """It sees one box in the middle of the window, where a blue thing is."""
+    model = advsearch.load_model(Finder(), labels=["mug", "bowl", "dog"], input_size=32, task="detection")
+    result = advsearch.twins(
+        PHOTOGRAPHS, network=model, names={"obj_000002": "mug", "obj_000001": "mug"}, frames="0:3", spp=1, margin=0.1,
+        task="detection", environment="studio", run=str(tmp_path / "run"),
+    )  # fmt: skip
+    right = {(pair.row.object, pair.row.photo.right, pair.row.twin(COMPOSED).right) for pair in result.pairs}
+    assert right == {("obj_000001", False, False), ("obj_000002", True, True)}
+    assert all("boxes" in json.dumps(pair.row.photo.payload) for pair in result.pairs)
 
 
 @pytest.mark.medium

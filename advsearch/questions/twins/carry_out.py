@@ -33,6 +33,7 @@ from advsearch.questions.twins.result import (
     COMPOSED,
     DETECTOR_MARGIN,
     HOLE,
+    PHOTOGRAPH,
     TwinPair,
     TwinPrediction,
     TwinRow,
@@ -75,8 +76,6 @@ def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> Twins
         [network or config.model], task, settings
     )
     task = task.on(model)
-    if task.ambiguities:
-        raise InputError(f"task {task.name}: {task.ambiguities}")
     comparison = Comparison(context, task, model)
     selection = comparison.select(listing.objects)
     if listing.n_missing:
@@ -113,6 +112,7 @@ class Comparison:
         self._model = model
         self._size = model.input_size
         self.n_renders = 0
+        self._is_calibrated = False
         self._load_photograph = lru_cache(maxsize=4)(rendering.load_photograph)
 
     @property
@@ -291,8 +291,9 @@ class Comparison:
     def _predict(self, twin: rendering.Twin, facts: Any) -> Iterator[TwinPrediction]:
         """Yield the predictions about the photograph and its twins."""
         truth = self._task.truth(facts)
+        self._calibrate_once(twin, truth)
         for name, image in twin.images.items():
-            rounded = (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
+            rounded = round_to_levels(image)
             output = self._model(rounded)
             (judgement,) = workbench.judge_images(
                 self._task, output, rounded[None], [truth]
@@ -305,6 +306,21 @@ class Comparison:
                 margin=judgement.margin,
                 payload=judgement.payload,
             )
+
+    def _calibrate_once(self, twin: rendering.Twin, truth: Any) -> None:
+        """Let a task that needs it look at the first photograph.
+
+        Raises:
+            InputError: the user has to state how the outputs are read.
+        """
+        if self._is_calibrated:
+            return
+        self._is_calibrated = True
+        if self._task.calibrates:
+            output = self._model(round_to_levels(twin.images[PHOTOGRAPH]))
+            self._task = self._task.after_calibration(output, truth)
+        if self._task.ambiguities:
+            raise InputError(f"task {self._task.name}: {self._task.ambiguities}")
 
     def _make_facts(
         self, item: PhotographedObject, twin: rendering.Twin | None = None
@@ -358,6 +374,11 @@ class Comparison:
             renders=self.n_renders,
             warnings=list(dict.fromkeys(warnings)),
         )
+
+
+def round_to_levels(image: Tensor) -> Tensor:
+    """Return an image (H, W, 3) with values of 8 bits, in [0, 1]."""
+    return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
 
 
 def rank_disagreement(row: TwinRow) -> tuple[bool, float]:
