@@ -90,7 +90,7 @@ def test_a_detector_is_judged_by_the_box_of_the_pose(tmp_path: Path) -> None:
     )  # fmt: skip
     right = {(pair.row.object, pair.row.photo.right, pair.row.twin(COMPOSED).right) for pair in result.pairs}
     assert right == {("obj_000001", False, False), ("obj_000002", True, True)}
-    assert all("boxes" in json.dumps(pair.row.photo.payload) for pair in result.pairs)
+    assert all("box" in json.dumps(pair.row.photo.payload) for pair in result.pairs)
 
 
 @pytest.mark.medium

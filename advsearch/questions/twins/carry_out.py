@@ -193,7 +193,7 @@ class Comparison:
             missing = [
                 number
                 for number in numbers
-                if measurements.stored(make_row_name(number)) is None
+                if measurements.read(make_row_name(number)) is None
             ]
             # Mitsuba can't record renders of one scene while another one lives.
             layers = self._render_layers(selection, missing)
