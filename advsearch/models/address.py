@@ -76,10 +76,10 @@ Image8Bit: TypeAlias = npt.NDArray[
 class AnswerStore(Protocol):
     """The store of a run, with its notes."""
 
-    def noted(self, key: str) -> Any:
+    def read_json_note(self, key: str) -> Any:
         """Return a JSON value, or None."""
 
-    def set_note(self, key: str, value: str) -> None:
+    def write_note(self, key: str, value: str) -> None:
         """Store JSON text under a key."""
 
 
