@@ -65,7 +65,8 @@ def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> Twins
 
     Args:
         context: of the run.
-        network: the model, where a Python caller passes one.
+        network: the model, where a Python caller passes one; or a mapping from the
+            names of frames to models, each of which has not seen its frames.
     """
     config = context.config
     context.progress.stage("loading")
