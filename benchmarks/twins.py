@@ -5,9 +5,8 @@
 
 DATA is a folder in BOP's form, or a list. With --train a linear layer is fitted on what
 a backbone (an exported program: images in, numbers out) says of the crops of other
-frames. Frames are cut into blocks of neighbours; each block is judged by a classifier
-that was fitted on the others, and is a run of its own. Then the rows of all blocks are
-counted together. No data is in this repository.
+frames. Frames are cut into blocks of neighbours, and each block is judged by a
+classifier that was fitted on the others. No data is in this repository.
 """
 
 from __future__ import annotations
@@ -25,13 +24,9 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.questions.twins import rendering, twins
-from advsearch.questions.twins.counting import make_table
 from advsearch.questions.twins.listing import PhotographedObject, read_photographs
 from advsearch.questions.twins.result import (
     CLASSIFIER_MARGIN,
-    COMPOSED,
-    HOLE,
-    TwinRow,
     make_agreement_part,
 )
 
@@ -41,7 +36,6 @@ N_CELLS = 3  # along each side of the grid that features are averaged over
 RIDGE = 1.0
 SHARPNESS = 5.0  # logits of a unit of the fitted targets, which are -1 and 1
 MIN_VISIBLE = 0.1
-ALL_ROWS = 1000
 
 
 class Features(nn.Module):
@@ -135,7 +129,7 @@ def cut_frames(objects: Sequence[PhotographedObject], n_folds: int) -> list[list
     return [list(block) for block in np.array_split(np.array(frames), n_folds)]
 
 
-def run_folds(options: argparse.Namespace) -> list[TwinRow]:
+def run_folds(options: argparse.Namespace) -> list[str]:
     """Judge each block of frames by a classifier that was fitted on the others."""
     objects = read_photographs(options.data).objects
     names = sorted({item.object for item in objects})
@@ -150,42 +144,31 @@ def run_folds(options: argparse.Namespace) -> list[TwinRow]:
         labels += [names.index(item.object)] * len(images)
     features = torch.cat(blocks)
     targets = torch.tensor(labels)
-    rows: list[TwinRow] = []
+    model_of_frame = {}
     for number, block in enumerate(cut_frames(objects, options.folds)):
         is_other = torch.tensor([frame not in block for frame in frames])
         head = fit_head(backbone, features[is_other], targets[is_other], len(names))
         accuracy = head.classify(features[~is_other]).argmax(1) == targets[~is_other]
         print(f"fold {number}: right in {float(accuracy.float().mean()):.3f} of crops")
         model = advsearch.load_model(
-            head, labels=names, input_size=SIZE, name=f"fold {number}"
+            head, labels=names, input_size=SIZE, name="fitted on other frames"
         )
-        result = twins(
-            options.data,
-            network=model,
-            frames=",".join(block),
-            pictures=ALL_ROWS,
-            environment=options.environment,
-            spp=options.spp,
-            run=str(options.out / f"fold-{number}"),
-            overwrite=True,
-        )
-        rows += [pair.row for pair in result.pairs]
-    return rows
+        model_of_frame |= dict.fromkeys(block, model)
+    return run_twins(options, network=model_of_frame)
 
 
-def run_model(options: argparse.Namespace) -> list[TwinRow]:
-    """Judge all photographs by one model."""
+def run_twins(options: argparse.Namespace, **model: Any) -> list[str]:
+    """Run the command, and return the lines of its table."""
     result = twins(
         options.data,
-        model=options.model,
-        labels=options.labels,
-        pictures=ALL_ROWS,
+        **model,
         environment=options.environment,
         spp=options.spp,
-        run=str(options.out / "twins"),
+        run=str(options.out),
         overwrite=True,
     )
-    return [pair.row for pair in result.pairs]
+    part = make_agreement_part(result.table)
+    return [" | ".join(row) for row in (part.heads, *part.rows)]
 
 
 def main() -> None:
@@ -199,13 +182,11 @@ def main() -> None:
     parser.add_argument("--environment", default="room")
     parser.add_argument("--spp", type=int, default=32)
     options = parser.parse_args()
-    rows = run_folds(options) if options.train else run_model(options)
-    surroundings = (COMPOSED, options.environment, HOLE)
-    part = make_agreement_part(
-        make_table(rows, surroundings, "folds", "classification")
-    )
-    for line in (part.heads, *part.rows):
-        print(" | ".join(line))
+    if options.train:
+        lines = run_folds(options)
+    else:
+        lines = run_twins(options, model=options.model, labels=options.labels)
+    print("\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -73,11 +73,14 @@ def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> Twins
     listing = read_photographs(Path(config.photographs).expanduser())
     task = workbench.make_task(config.task)
     settings: Any = config
-    (model,), warnings = workbench.load_models(
-        [network or config.model], task, settings
-    )
-    task = task.on(model)
-    comparison = Comparison(context, task, model)
+    by_frame = network if isinstance(network, Mapping) else {}
+    networks = list(dict.fromkeys(by_frame.values())) or [network or config.model]
+    models, warnings = workbench.load_models(networks, task, settings)
+    model_of_frame = {
+        frame: models[networks.index(model)] for frame, model in by_frame.items()
+    }
+    task = task.on(models[0])
+    comparison = Comparison(context, task, models[0], model_of_frame)
     selection = comparison.select(listing.objects)
     if listing.n_missing:
         warnings.append(
@@ -102,15 +105,21 @@ class Comparison:
         context: of the run.
         task: judges the predictions of the model.
         model: predicts.
+        model_of_frame: models that predict some frames instead.
     """
 
     def __init__(
-        self, context: RunContext[TwinsConfig], task: Task, model: Model
+        self,
+        context: RunContext[TwinsConfig],
+        task: Task,
+        model: Model,
+        model_of_frame: Mapping[str, Model],
     ) -> None:
         self._context = context
         self._config = context.config
         self._task = task
         self._model = model
+        self._model_of_frame = model_of_frame
         self._size = model.input_size
         self.n_renders = 0
         self._is_calibrated = False
@@ -286,16 +295,22 @@ class Comparison:
             contrast=twin.contrast,
             visible=item.visible,
             overlap=rendering.measure_pose(item, twin, window),
-            predictions=list(self._predict(twin, facts)),
+            predictions=list(
+                self._predict(
+                    self._model_of_frame.get(item.frame, self._model), twin, facts
+                )
+            ),
         )
 
-    def _predict(self, twin: rendering.Twin, facts: Any) -> Iterator[TwinPrediction]:
+    def _predict(
+        self, model: Model, twin: rendering.Twin, facts: Any
+    ) -> Iterator[TwinPrediction]:
         """Yield the predictions about the photograph and its twins."""
         truth = self._task.truth(facts)
         self._calibrate_once(twin, truth)
         for name, image in twin.images.items():
             rounded = round_to_levels(image)
-            output = self._model(rounded)
+            output = model(rounded)
             (judgement,) = workbench.judge_images(
                 self._task, output, rounded[None], [truth]
             )
