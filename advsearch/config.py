@@ -511,6 +511,7 @@ class SceneConfig(Config):
     @field_validator("prompt", mode="before")
     @classmethod
     def _prompts_as_text(cls, value: Any) -> Any:
+        """Join a list of prompts by " | "; none of them may be empty."""
         if isinstance(value, (list, tuple)) and all(
             isinstance(text, str) for text in value
         ):
@@ -641,6 +642,7 @@ class RenderConfig(SceneConfig):
     @field_validator("out", mode="before")
     @classmethod
     def _picture_file(cls, value: Any) -> Any:
+        """Check that a path has the suffix of an image and no NUL character."""
         text = str(value) if isinstance(value, Path) else value
         if (
             not isinstance(text, str)

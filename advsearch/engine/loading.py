@@ -29,7 +29,11 @@ from advsearch.options import describe_value, format_things
 from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Float32Array, ObjectAsset
-from advsearch.scene.backdrop import BackdropPhotograph, fit_to_photograph
+from advsearch.scene.backdrop import (
+    BackdropPhotograph,
+    find_light_beside,
+    fit_to_photograph,
+)
 from advsearch.scene.camera_model import make_bundled_models, make_pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
@@ -269,7 +273,8 @@ def load_scene(
             180}; `size` (metres), `name` and `label` are optional.
         backdrop: a photograph that the scene is rendered into (docs/cameras.md): a
             picture file, taken by `camera`; of a part of it,
-            ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels.
+            ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels. By default it is lit by the .hdr
+            or .exr file of its name beside it, if there is one.
         occluder: a mask of the photograph's size, white where it shows what is before
             the object.
 
@@ -286,6 +291,8 @@ def load_scene(
     if scene is not None and mitsuba_dict is None:
         object_spec = f"{scene}#{object}"
     fixed_values = None if settings is None else to_python(settings)
+    if environment is None:
+        environment = find_light_beside(backdrop)
     description = load_description(
         object_spec,
         environment,
@@ -446,9 +453,19 @@ def make_renderer(
 ) -> Renderer:
     """Load a described scene, with what the space's controls need, into Mitsuba.
 
-    How fast coordinates move outlines is measured only where pictures are
-    differentiated with respect to them: it takes a third of the time in which a scene
-    is loaded and a few small pictures are rendered.
+    Args:
+        description: the scene; that of the space, if it has one, takes its place.
+        space: what varies.
+        resolution: side, or (height, width), in pixels.
+        denoise: "oidn" or "none".
+        seed: root of the noise.
+        estimators: as for `Scene.renderer`.
+        leave_out: what may be left out of the scene where it makes no difference.
+        sampler: "multijitter" or "independent".
+        differentiated: whether images are differentiated with respect to coordinates.
+            If not, it is not measured how fast coordinates move outlines, which takes a
+            third of the time in which a scene is loaded and a few small images are
+            rendered.
 
     Raises:
         InputError: the scene has no light, or its cameras differ in time and nothing
@@ -491,21 +508,24 @@ def make_renderer(
 
 
 def _check_rig_times(description: SceneDescription, space: Space) -> None:
-    """Check that the pictures of a rig can be taken one after the other, if they are.
+    """Check a rig whose cameras take their images one after the other.
+
+    Such a rig needs something that changes with time, and no motion blur.
 
     Raises:
-        InputError: nothing changes with time, or a picture has motion blur.
+        InputError: nothing changes with time, or an image has motion blur.
     """
     if not any(mount.delay for mount in description.rig):
         return
-    in_order = (
+    prefix = (
         f"camera: the pictures of {description.rig_spec} are taken one after the other"
     )
     if any(space.exposure):
         raise InputError(
-            f"{in_order}, and can not have motion blur or a rolling shutter; "
+            f"{prefix}, and can not have motion blur or a rolling shutter; "
             "leave that out"
         )
+    # `advance_time` returns the same object for a control that is static.
     controls_later = space.advance_time(1.0).controls
     changes_with_time = any(
         control is not control_later
@@ -513,23 +533,23 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
     )
     if not changes_with_time:
         raise InputError(
-            f"{in_order}, and show the same: nothing knows a time; add a `path`"
+            f"{prefix}, and show the same: nothing knows a time; add a `path`"
         )
 
 
 MOMENTS_PER_FLASH = 8  # moments of each flash of a light
-N_MOTION_SAMPLES = (
-    64  # random configurations on which motion during an exposure is measured
-)
+# random configurations on which motion during an exposure is measured
+N_MOTION_SAMPLES = 64
 
 
 def choose_moments(
     space: Space, motion: Motion, assembly: Assembly, height: int
 ) -> tuple[Moment, ...]:
-    """Return the moments of an exposure at which a picture is rendered.
+    """Return the moments of an exposure at which an image is rendered.
 
-    There are enough of them that no point moves far in the picture between two moments,
-    and that a flashing light is seen on and off. `height` is in pixels.
+    There are enough of them that no point moves far in the image between two moments
+    (`MOMENTS_PER_PIXEL`), and that a flashing light is on in some and off in others;
+    at least `MIN_MOMENTS` and at most `MAX_MOMENTS`. `height` is in pixels.
     """
     shutter, rolling = space.exposure
     duration = shutter + abs(rolling)

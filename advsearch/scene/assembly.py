@@ -29,7 +29,7 @@ from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import (
     camera_to_world,
     compute_car_pose,
-    compute_seated_pose,
+    compute_carried_pose,
     project_points,
 )
 from advsearch.scene.gradients import Group
@@ -250,7 +250,9 @@ def _move_carried(
         moved_inputs[f"{part.name}.offsets"] = offsets[follows]
     if pose is not None and isinstance(part, BeamLamp):
         car_pose = compute_car_pose(pose) if part.carrier == CAMERA else pose
-        pose = compute_seated_pose(car_pose, torch.from_numpy(part.seat).to(pose))
+        pose = compute_carried_pose(
+            car_pose, torch.from_numpy(part.pose_on_carrier).to(pose)
+        )
     if pose is not None:
         moved_inputs[f"{part.name}.to_world"] = pose
     return moved_inputs

@@ -48,7 +48,11 @@ from advsearch.scene.color import CHANNELS, linear_to_srgb, srgb_to_linear
 from advsearch.scene.geometry import camera_to_world, object_to_world, project_points
 from advsearch.scene.image_quality import make_noise, measure_blur, measure_noise
 from advsearch.scene.importing.pictures import average_area
-from advsearch.trust.stored_files import LARGEST_FILE, track_opened_files
+from advsearch.trust.stored_files import (
+    LARGEST_FILE,
+    record_opened,
+    track_opened_files,
+)
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -74,6 +78,7 @@ ALBEDO_RANGE = (0.05, 0.8)  # of the plane
 CONTACT_RING = (0.5, 1.5)
 N_CONTACT_POINTS = 400
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue (BT.709)
+LIGHT_SUFFIXES = (".hdr", ".exr")
 CROP = re.compile(r"(?P<path>.+)#(?P<numbers>\d+,\d+,\d+,\d+)")
 
 
@@ -203,6 +208,24 @@ def read_backdrop(spec: str | Path) -> BackdropPhotograph:
             f"{path}, got {crop[2]} x {crop[3]}; take another photograph"
         )
     return make_backdrop(levels, text, crop)
+
+
+def find_light_beside(photograph: object) -> Path | None:
+    """Return the environment map that lies beside a photograph, or None.
+
+    It is called as the photograph, with the suffix .hdr or .exr.
+    """
+    if not isinstance(photograph, (str, Path)):
+        return None
+    part = CROP.fullmatch(str(photograph))
+    path = Path(part["path"] if part else photograph)
+    for suffix in LIGHT_SUFFIXES:
+        light = path.with_suffix(suffix)
+        if light != path and light.is_file():
+            with track_opened_files(path):
+                record_opened(light)
+            return light
+    return None
 
 
 def with_front(photograph: BackdropPhotograph, spec: str | Path) -> BackdropPhotograph:

@@ -478,8 +478,8 @@ class SceneDescription:
             carrier = torch.from_numpy(self.meshes[part.carrier].to_world)
         return replace(
             part,
-            to_world=geometry.compute_seated_pose(
-                carrier, torch.from_numpy(part.seat)
+            to_world=geometry.compute_carried_pose(
+                carrier, torch.from_numpy(part.pose_on_carrier)
             ).numpy(),
         )
 

@@ -190,6 +190,20 @@ def test_light_and_ground_follow_from_the_photograph(tmp_path: Path) -> None:
     assert compute_plane_radiance(below.with_backdrop(tmp_path / "a.png")) is None, "the camera is below the ground"
 
 
+def test_the_map_beside_a_photograph_lights_it(tmp_path: Path) -> None:
+    from advsearch.trust.stored_files import list_opened_files
+
+    write_photograph(tmp_path / "a.png")
+    # Radiance's header, and two rows of eight texels of 2, 1 and 1
+    texels = bytes([128, 64, 64, 130]) * 16
+    (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n" + texels)
+    scene = advsearch.load_scene("mug", backdrop=f"{tmp_path / 'a.png'}#0,0,20,15")
+    environment = scene.description.environment
+    assert environment is not None and environment.radiance[0, 0].tolist() == pytest.approx([2.0, 1.0, 1.0], rel=0.02)
+    assert str(tmp_path / "a.hdr") in list_opened_files(tmp_path / "a.png"), "a run keeps its digest"
+    assert advsearch.load_scene("mug", "studio", backdrop=tmp_path / "a.png").description.environment_name == "studio"
+
+
 # ---- noise, blur and what is in front
 
 

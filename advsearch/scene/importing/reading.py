@@ -20,8 +20,8 @@ from advsearch.scene.importing.files import check_faces as check_faces
 from advsearch.scene.importing.files import damaged as damaged
 from advsearch.scene.importing.files import describe_content as describe_content
 from advsearch.scene.importing.files import format_name as format_name
+from advsearch.scene.importing.files import get_last_line as get_last_line
 from advsearch.scene.importing.files import is_number as is_number
-from advsearch.scene.importing.files import last_line as last_line
 from advsearch.scene.importing.files import read_bytes as read_bytes
 from advsearch.scene.importing.geometry import triangulate as triangulate
 from advsearch.scene.importing.parts import ImportedPart as ImportedPart

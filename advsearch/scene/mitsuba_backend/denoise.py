@@ -167,12 +167,12 @@ def _compute_gain(radiance: Tensor) -> float:
     row_counts = np.diff(row_starts, append=height)
     column_counts = np.diff(column_starts, append=width)
     row_sums = np.add.reduceat(luminance, row_starts, axis=0)
-    sums = np.add.reduceat(row_sums, column_starts, axis=1)
-    means = sums / np.outer(row_counts, column_counts)
-    means = means[means > MIN_LUMINANCE]
-    if not means.size:
+    bin_sums = np.add.reduceat(row_sums, column_starts, axis=1)
+    bin_means = bin_sums / np.outer(row_counts, column_counts)
+    bin_means = bin_means[bin_means > MIN_LUMINANCE]
+    if not bin_means.size:  # the image is black
         return 1.0
-    return float(KEY_LUMINANCE / np.exp2(np.log2(means).mean()))
+    return float(KEY_LUMINANCE / np.exp2(np.log2(bin_means).mean()))
 
 
 def _find_bin_starts(size: int) -> IntArray:

@@ -87,12 +87,15 @@ def _compute_cap_height(
 
 
 def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
-    """Return the index of the highest drop in each cell, as in `sample_raindrops`."""
+    """Return the index of the highest drop in each cell, as in `sample_raindrops`.
+
+    Drops (count, 4) and the half width of the sheet are as there too.
+    """
     cell_centers = (
         np.arange(GRID_SIZE) + 0.5
     ) / GRID_SIZE * 2.0 * half_width - half_width
     highest_drop = np.full((GRID_SIZE, GRID_SIZE), len(drops))
-    highest = np.zeros((GRID_SIZE, GRID_SIZE))
+    max_height = np.zeros((GRID_SIZE, GRID_SIZE))
     for index, (x, y, radius, curvature_radius) in enumerate(drops):
         rows = np.flatnonzero(np.abs(cell_centers - y) <= radius)
         columns = np.flatnonzero(np.abs(cell_centers - x) <= radius)
@@ -101,9 +104,9 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
         distance_squared = dy[:, None] ** 2 + dx[None] ** 2
         height = _compute_cap_height(distance_squared, radius, curvature_radius)
         cells = np.ix_(rows, columns)
-        is_higher = (distance_squared < radius**2) & (height > highest[cells])
+        is_higher = (distance_squared < radius**2) & (height > max_height[cells])
         highest_drop[cells] = np.where(is_higher, index, highest_drop[cells])
-        highest[cells] = np.where(is_higher, height, highest[cells])
+        max_height[cells] = np.where(is_higher, height, max_height[cells])
     return highest_drop
 
 
@@ -143,6 +146,10 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
     Derivatives are right for the haze's color, for emission, for everything that
     surfaces look up, and for the density where it is greater than 0. Moving geometry
     has none.
+
+    Attributes:
+        haze: the medium.
+        radius: of the ball that it fills.
 
     Properties in addition to those of `prb`: `medium`, a homogeneous medium with grey
     extinction, and `radius`, that of the ball around the origin which the medium fills.
@@ -191,7 +198,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             # ---- the next event: a surface, the outside, or the haze before it
             is_first = bounces + scatterings == 0
             si = self._intersect(scene, ray, is_first, active)
-            haze_start, haze_length = self._haze_segment(ray.o, ray.d, si.t)
+            haze_start, haze_length = self._find_haze_segment(ray.o, ray.d, si.t)
             with dr.resume_grad(when=not primal):
                 scattered, flight, weight, albedo, extinction = self._sample_flight(
                     sampler, haze_length, active
@@ -292,18 +299,26 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             )
         return si
 
-    def _haze_segment(
+    def _find_haze_segment(
         self, origin: Any, direction: Any, max_distance: Any
     ) -> tuple[Any, Any]:
-        """Return where the haze starts on a segment, and its length (0 for a miss)."""
-        middle = -dr.dot(origin, direction)
-        half = dr.sqrt(
+        """Return where the haze starts on a segment, and its length (0 for a miss).
+
+        The segment begins at an origin in a unit direction; the haze fills the ball
+        around the coordinates' origin.
+        """
+        closest_distance = -dr.dot(origin, direction)
+        # 0 where the ray passes the ball: then the length is 0 too
+        half_chord = dr.sqrt(
             dr.maximum(
-                dr.square(middle) - dr.squared_norm(origin) + self.radius**2, 0.0
+                dr.square(closest_distance) - dr.squared_norm(origin) + self.radius**2,
+                0.0,
             )
         )
-        start = dr.maximum(middle - half, 0.0)
-        return start, dr.maximum(dr.minimum(middle + half, max_distance) - start, 0.0)
+        start = dr.maximum(closest_distance - half_chord, 0.0)
+        return start, dr.maximum(
+            dr.minimum(closest_distance + half_chord, max_distance) - start, 0.0
+        )
 
     def _sample_flight(
         self, sampler: Any, haze_length: Any, active: Any
@@ -319,6 +334,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             dr.zeros(mi.MediumInteraction3f)
         )
         extinction = extinction[0]
+        # A haze of extinction 0 scatters infinitely far away.
         flight = -dr.log(1.0 - sampler.next_1d()) / dr.maximum(
             dr.detach(extinction), MIN_EXTINCTION
         )
@@ -346,7 +362,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         active = active & (ds.pdf != 0.0)
         is_outside = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         distance = dr.select(is_outside, dr.inf, ds.dist)
-        _, haze_length = self._haze_segment(event.p, ds.d, distance)
+        _, haze_length = self._find_haze_segment(event.p, ds.d, distance)
         if not primal:
             with dr.resume_grad():
                 attached = scene.eval_emitter_direction(event, ds, active)
@@ -515,10 +531,13 @@ class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
     def sample(
         self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
     ) -> Any:
-        """Return reflectance, coverage and guides; see `mi.SamplingIntegrator`."""
+        """Return reflectance, coverage and guides; see `mi.SamplingIntegrator`.
+
+        A ray goes on through a surface with the probability with which light passes it.
+        """
         active = mi.Bool(active)
         ray = mi.Ray3f(ray)
-        covered = mi.Bool(False)
+        is_covered = mi.Bool(False)
         albedo = mi.Spectrum(0.0)
         normal = mi.Normal3f(0.0)
         while active:
@@ -526,16 +545,17 @@ class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
             active &= si.is_valid()
             bsdf = si.bsdf()
             transmittance = dr.max(bsdf.eval_null_transmission(si, active))
-            passes = active & (sampler.next_1d(active) < transmittance)
-            stops = active & ~passes
-            albedo[stops] = bsdf.eval_diffuse_reflectance(si, stops)
-            normal[stops] = si.sh_frame.n
-            covered |= stops
+            passes_through = active & (sampler.next_1d(active) < transmittance)
+            is_stopped = active & ~passes_through
+            albedo[is_stopped] = bsdf.eval_diffuse_reflectance(si, is_stopped)
+            normal[is_stopped] = si.sh_frame.n
+            is_covered |= is_stopped
             ray = si.spawn_ray(ray.d)
-            active = passes
-        return albedo, covered, [*albedo, *normal]
+            active = passes_through
+        return albedo, is_covered, [*albedo, *normal]
 
     def aov_names(self) -> list[str]:
+        """Names of the channels after reflectance: of albedo and normal."""
         names = ("albedo", "normal")
         return [f"{name}.{channel}" for name in names for channel in "XYZ"]
 
@@ -548,7 +568,7 @@ MAX_CELLS = 512
 NO_DROP = (0.0, 0.0, -1.0, 1.0)  # center, radius and curvature: a drop without inside
 
 
-def _transmittance(
+def _compute_transmittance(
     cos_incident: Any, cos_refracted: Any, ior_incident: float, ior_refracted: float
 ) -> Any:
     """Return Fresnel's transmittance of unpolarised light between two media.
@@ -580,27 +600,38 @@ def _refract_through_drop(
         The direction behind the drop, not normalised; the fraction of the light that
         passes; and whether the ray is lost by total reflection.
     """
-    inner = mi.Vector3f(direction.x / WATER_IOR, direction.y / WATER_IOR, 0.0)
-    inner.z = dr.safe_sqrt(1.0 - inner.x * inner.x - inner.y * inner.y)
+    inside_direction = mi.Vector3f(
+        direction.x / WATER_IOR, direction.y / WATER_IOR, 0.0
+    )
+    inside_direction.z = dr.safe_sqrt(
+        1.0
+        - inside_direction.x * inside_direction.x
+        - inside_direction.y * inside_direction.y
+    )
 
     # From the center of curvature: where the ray enters, and where it leaves.
     entry = mi.Vector3f(dx, dy, dr.safe_sqrt(drop.w * drop.w - drop.z * drop.z))
-    along = dr.dot(entry, inner)
+    entry_cosine = dr.dot(entry, inside_direction)
     exit_distance = (
-        dr.safe_sqrt(along * along - dr.squared_norm(entry) + drop.w * drop.w) - along
+        dr.safe_sqrt(
+            entry_cosine * entry_cosine - dr.squared_norm(entry) + drop.w * drop.w
+        )
+        - entry_cosine
     )
-    exit_point = entry + inner * exit_distance
+    exit_point = entry + inside_direction * exit_distance
     normal = exit_point / drop.w
 
-    cos_inside = dr.dot(inner, normal)
+    cos_inside = dr.dot(inside_direction, normal)
     cos_outside_squared = 1.0 - WATER_IOR * WATER_IOR * (1.0 - cos_inside * cos_inside)
     cos_outside = dr.safe_sqrt(cos_outside_squared)
-    outer = WATER_IOR * inner + (cos_outside - WATER_IOR * cos_inside) * normal
-    transmitted = _transmittance(direction.z, inner.z, 1.0, WATER_IOR) * _transmittance(
-        cos_inside, cos_outside, WATER_IOR, 1.0
+    outside_direction = (
+        WATER_IOR * inside_direction + (cos_outside - WATER_IOR * cos_inside) * normal
     )
-    is_lost = (cos_outside_squared <= 0.0) | (outer.z <= 0.0)
-    return outer, transmitted, is_lost
+    transmitted = _compute_transmittance(
+        direction.z, inside_direction.z, 1.0, WATER_IOR
+    ) * _compute_transmittance(cos_inside, cos_outside, WATER_IOR, 1.0)
+    is_lost = (cos_outside_squared <= 0.0) | (outside_direction.z <= 0.0)
+    return outside_direction, transmitted, is_lost
 
 
 class ModelledCamera(mi.Sensor):  # type: ignore[misc]
@@ -614,9 +645,16 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     Raindrops before the camera bend the rays, see the comment at the top.
 
     Parameters: `to_world`; `lens`, its numbers in the order of `NUMBER_NAMES`.
+
+    Attributes:
+        pose: Mitsuba's transform from the camera's axes (left, up, ahead) to the world.
+        lens: the numbers.
+        rays: four numbers for each grid point, row by row: direction and margin, see
+            `CameraModel.make_ray_table`.
     """
 
     def __init__(self, props: Any) -> None:
+        """Read the model, the clipping and perhaps drops from the sensor's properties."""
         super().__init__(props)
         values = tuple(float(props[name]) for name in NUMBER_NAMES)
         self._model = CameraModel(
@@ -624,20 +662,23 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         )
         self._near = float(props["near_clip"])
         self._far = float(props["far_clip"])
-        self._cells = tuple(
+        self._grid_cells = tuple(
             max(MIN_CELLS, min(MAX_CELLS, int(size)))
             for size in self.film().crop_size()
         )
         self.pose = mi.Transform4f(super().world_transform())
         self.lens = mi.TensorXf(list(values), (len(NUMBER_NAMES),))
         self._make_rays()
-        self._half = 0.0  # width of the square with drops; 0 without drops
+        self._sheet_half_width = 0.0  # width of the square with drops; 0 without drops
         if "drops" in props:
             self._make_drops(props)
 
     def _make_drops(self, props: Any) -> None:
-        """Sample the raindrops that the sensor's properties describe."""
-        self._half, drops, grid = sample_raindrops(
+        """Sample the raindrops that the sensor's properties describe.
+
+        From then on rays take a sample of the aperture (`sample3`).
+        """
+        self._sheet_half_width, drops, grid = sample_raindrops(
             int(props["drops"]),
             float(props["drop_size"]),
             int(props["drop_seed"]),
@@ -651,16 +692,19 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         self.m_needs_sample_3 = True
 
     def traverse(self, cb: Any) -> None:
+        """Tell Mitsuba the parameters that may be set."""
         super().traverse(cb)
         cb.put("to_world", self.pose, mi.ParamFlags.NonDifferentiable)
         cb.put("lens", self.lens, mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: Any) -> None:
+        """Compute the rays anew after the lens has changed, or possibly has."""
         if not keys or "lens" in keys:
             self._make_rays()
         super().parameters_changed(keys)
 
     def world_transform(self) -> Any:
+        """Return the pose; Mitsuba's own is not updated."""
         return self.pose
 
     def sample_ray_differential(
@@ -672,7 +716,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         """
         direction, is_inside = self._look_up_direction(sample2)
         transmitted = mi.Float(1.0)
-        if self._half > 0.0:
+        if self._sheet_half_width > 0.0:
             direction, transmitted = self._bend_by_drops(direction, sample3)
         weight = dr.select(is_inside, transmitted, 0.0)
         # Every field is set: a ragged ray has no derivatives.
@@ -697,12 +741,12 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
 
         Ground truth such as depth is that of the scene behind the drops.
         """
-        half_width = self._half
-        self._half = 0.0
+        half_width = self._sheet_half_width
+        self._sheet_half_width = 0.0
         try:
             return self.sample_ray(time, 0.5, position, mi.Point2f(0.5))
         finally:
-            self._half = half_width
+            self._sheet_half_width = half_width
 
     def _bend_by_drops(self, direction: Any, sample: Any) -> tuple[Any, Any]:
         """Refract the rays that meet a drop.
@@ -711,15 +755,20 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
             The unit directions, and the fraction of the light that passes (1 without a
             drop, 0 where a drop reflects it inside).
         """
-        lens = APERTURE_RADIUS * mi.warp.square_to_uniform_disk_concentric(sample)
-        reach = SHEET_DISTANCE / dr.maximum(direction.z, 1e-3)
-        x = direction.x * reach + lens.x
-        y = direction.y * reach + lens.y
+        aperture_point = APERTURE_RADIUS * mi.warp.square_to_uniform_disk_concentric(
+            sample
+        )
+        sheet_distance = SHEET_DISTANCE / dr.maximum(direction.z, 1e-3)
+        x = direction.x * sheet_distance + aperture_point.x
+        y = direction.y * sheet_distance + aperture_point.y
+        # 0.1: rays almost along the sheet meet no drop
         drop, dx, dy, is_hit = self._find_drop(x, y, direction.z > 0.1)
         refracted, transmitted, is_lost = _refract_through_drop(direction, dx, dy, drop)
         weight = dr.select(is_hit, dr.select(is_lost, 0.0, transmitted), 1.0)
-        bent = dr.select(is_hit & ~is_lost, dr.normalize(refracted), direction)
-        return bent, weight
+        refracted_direction = dr.select(
+            is_hit & ~is_lost, dr.normalize(refracted), direction
+        )
+        return refracted_direction, weight
 
     def _find_drop(self, x: Any, y: Any, active: Any) -> tuple[Any, Any, Any, Any]:
         """Find the drop at a point of the sheet, in millimetres.
@@ -728,7 +777,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
             The drop's four numbers, as in `sample_raindrops`; the point's x and y from
             the drop's center; and whether there is a drop at all.
         """
-        half_width = self._half
+        half_width = self._sheet_half_width
         cells_per_mm = GRID_SIZE / (2.0 * half_width)
         column = (x + half_width) * cells_per_mm
         row = (y + half_width) * cells_per_mm
@@ -751,7 +800,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
 
     def _make_rays(self) -> None:
         """Compute the grid of ray directions from the lens's numbers."""
-        n_columns, n_rows = self._cells
+        n_columns, n_rows = self._grid_cells
         x = torch.linspace(0.0, 1.0, n_columns + 1, dtype=torch.float64)
         y = torch.linspace(0.0, 1.0, n_rows + 1, dtype=torch.float64)
         positions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
@@ -766,7 +815,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
 
         The second value is whether the lens has a direction there at all.
         """
-        n_columns, n_rows = self._cells
+        n_columns, n_rows = self._grid_cells
         x = position.x * n_columns
         y = position.y * n_rows
         column = dr.clip(mi.Int32(dr.floor(x)), 0, n_columns - 1)
