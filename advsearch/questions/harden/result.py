@@ -65,6 +65,7 @@ class HardenConfig(AttackConfig):
         "minimise", "over", "draws", "path", "shutter", "rolling", "average",
         "baseline", "seconds", "camera", "up", "facing", "size", "unit", "label",
         "measure", "estimators", "things", "judge", "backdrop", "occluder",
+        "twins",
     )
 
     object: str = setting_as_in(
