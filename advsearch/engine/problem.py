@@ -323,6 +323,7 @@ class Problem:
         spp: int,
         *,
         is_random: Tensor | None = None,
+        renderer: Renderer | None = None,
     ) -> ComparedView:
         """Compare a predicted image with traced images of the same configuration.
 
@@ -333,6 +334,7 @@ class Problem:
             spp: samples per pixel of a rendered image.
             is_random: (d,) bool, the searched coordinates that are random here: the
                 search has not moved them.
+            renderer: traces the images; None for that of the problem.
         """
         dim = self.domain.dim
         with torch.no_grad():
@@ -346,7 +348,13 @@ class Problem:
             return self.judge(image, u).margin
 
         return compare_with_traced(
-            self.renderer, predicted, full_u, seed, spp, measure_margin, predicted_start
+            renderer or self.renderer,
+            predicted,
+            full_u,
+            seed,
+            spp,
+            measure_margin,
+            predicted_start,
         )
 
     def find_marks(self, image: Tensor, full_u: Tensor) -> list[Mark]:

@@ -64,9 +64,10 @@ class RunState:
     interrupted: bool = False
     # what predicted the pictures of the searches, if anything did
     predictor: PredictedSearch | None = None
-    predictor_refusal: Refusal | None = None  # why nothing did
+    predictor_refusal: Refusal | None = None  # why nothing did, or only a crop
     # why matrices did and not light on surfaces, where that was tried
     surface_light_refusal: Refusal | None = None
+    crop_refusal: Refusal | None = None  # why whole images were rendered
     # renders spent on choosing the sample count and on trials
     verification_renders: int = 0
     n_predicted_trials: int = 0
@@ -85,11 +86,13 @@ class RunState:
         """How the images of the searches were predicted, or why they were not."""
         if self.predictor is None:
             reason = str(self.predictor_refusal or "nothing was searched")
-            return LinearTransport(used=False, reason=reason)
+            crop = str(self.crop_refusal) if self.crop_refusal else None
+            return LinearTransport(used=False, reason=reason, crop=crop)
         summary = self.predictor.summarize()
-        if summary.reason or not self.surface_light_refusal:
+        refusal = self.predictor_refusal or self.surface_light_refusal
+        if summary.reason or not refusal:
             return summary
-        return summary.model_copy(update={"reason": str(self.surface_light_refusal)})
+        return summary.model_copy(update={"reason": str(refusal)})
 
 
 # the label of an image whose workers all died; the payload of its row has the reason
@@ -150,7 +153,7 @@ def add_judgement(row: Row, judgement: Judgement) -> Row:
         score=_none_if_nan(judgement.score),
         correct=judgement.right,
         margin=_none_if_nan(judgement.margin),
-        label=None if judgement.is_not_a_number else prediction.label,
+        label=None if judgement.is_non_finite else prediction.label,
         label_index=prediction.index,
         probability=prediction.probability,
         payload=judgement.payload,
@@ -223,7 +226,7 @@ def make_control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
 
 def _rate_fields(rate: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:
     """Return the fields that all rates of a result have."""
-    n_not_a_number = sum(trial.is_not_a_number for trial in trials)
+    n_not_a_number = sum(trial.is_non_finite for trial in trials)
     return {
         "trials": rate.trials,
         "rate": rate.rate,

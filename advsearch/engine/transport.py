@@ -25,6 +25,13 @@ from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.engine.acceptance import ComparedView, Deviation, compare_views
 from advsearch.engine.problem import Problem
+from advsearch.engine.windows import (
+    WholeImage,
+    Windowing,
+    find_window,
+    measure_outside,
+    render_whole,
+)
 from advsearch.runs.results import BankOfConditions, LinearTransport, PredictionError
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.predictor import Predictor, Refusal, RefusalCause
@@ -35,6 +42,7 @@ from advsearch.scene.transport.lights import (
     make_predictor,
 )
 from advsearch.scene.transport.matrix import ProgressCallback
+from advsearch.scene.window import Window
 
 MIN_STEPS = 16
 """Evaluations of a search from which on the matrix pays.
@@ -45,10 +53,10 @@ It costs as much as some 6 rendered evaluations with gradients
 # evaluations for each light from which on basis images pay
 MIN_STEPS_PER_LIGHT = 8
 COMPARISON_INTERVAL = 20  # evaluations from one comparison to the next
+SURROUNDINGS_SPP = 32  # samples per pixel of what is outside of a matrix's window
 MIN_SCORES = 4  # trials from which a standard deviation is estimated
-LOWER_END_DEVIATIONS = (
-    1.64  # standard deviations below the mean above which 19 of 20 scores lie
-)
+# standard deviations below the mean above which 19 of 20 scores lie
+LOWER_END_DEVIATIONS = 1.64
 ADVICE = {
     RefusalCause.HAZE: "leave the haze out",
     RefusalCause.NOISE: "`denoise=oidn` takes the noise out",
@@ -113,11 +121,14 @@ class PredictedSearch(ABC):
 
     Attributes:
         method: method, for reports.
+        title: what its preparation does, for the progress.
+        what_it_renders: what the search renders afterwards, for the progress.
         is_exact: whether equal configurations have equal objectives.
         problem: of the searches.
         steps: evaluations of a search; those after them belong to the ranking, and are
             traced.
-        draws_conditions: whether each evaluation draws conditions; see `Domain.drawn`.
+        draws_conditions: whether each evaluation draws conditions; see
+            `Domain.draws_conditions`.
         deviations: from traced images, of each comparison.
         n_traced: images that were traced, for the predictor and to compare it.
         seconds: spent on both.
@@ -126,9 +137,12 @@ class PredictedSearch(ABC):
             as predictions were too far off.
         tracing_reason: why images are traced, as a sentence; None while they are
             predicted.
+        window: the window of the image that is traced; None for all of it.
     """
 
     method: ClassVar[str] = "matrix"
+    title: ClassVar[str] = "collecting light transport"
+    what_it_renders: ClassVar[str] = "renders nothing"
     is_exact: ClassVar[bool] = False
 
     problem: Problem
@@ -140,6 +154,7 @@ class PredictedSearch(ABC):
     n_renewals: int | None = field(default=0, kw_only=True)
     first_traced: dict[str, int] = field(default_factory=dict, kw_only=True)
     tracing_reason: str | None = field(default=None, kw_only=True)
+    window: Window | None = field(default=None, kw_only=True)
 
     @property
     @abstractmethod
@@ -196,7 +211,7 @@ class PredictedSearch(ABC):
     def compare(self, compare_view: Callable[[int], ComparedView]) -> Deviation:
         """Compare predictions with traced images, and store the deviation.
 
-        `compare_view` compares a single view; see `acceptance.compared`.
+        `compare_view` compares a single view; see `acceptance.compare_views`.
         """
         with self.count_time():
             self.deviations.append(compare_views(compare_view))
@@ -229,6 +244,7 @@ class PredictedSearch(ABC):
             used=True,
             way=self.method,
             reason=self.tracing_reason,
+            window=self.window,
             conditions=self.summarize_conditions(),
             entries=entries,
             bytes=n_bytes,
@@ -240,12 +256,12 @@ class PredictedSearch(ABC):
 
 @dataclass
 class CleanMatrix:
-    """The matrix of the clean configuration.
+    """The matrices of the clean configuration, by the window that was traced.
 
-    Attacks that differ only in their budget of change share it.
+    Attacks that differ only in their budget of change share them.
     """
 
-    predictor: Predictor | None = None
+    predictors: dict[Window | None, Predictor] = field(default_factory=dict)
 
 
 @dataclass
@@ -262,22 +278,33 @@ class Transport(PredictedSearch):
     _score_bias: float = 0.0
     # the latest matrix of each kind of search
     _current: dict[str, Predictor] = field(default_factory=dict)
+    # where a window is traced, the whole image behind each of them
+    _whole_images: dict[str, WholeImage] = field(default_factory=dict)
+    _is_prepared: bool = False
 
     @property
     def n_samples(self) -> int:
         return count_samples(self.problem.renderer)
 
     def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
-        if self.clean_matrix.predictor is None:
-            start = self.problem.domain.start
-            self.clean_matrix.predictor = self._make_predictor(start, "start", 0, tick)
+        if not self._is_prepared:
+            with self.count_time():
+                windowing = find_window(self.problem)
+            if isinstance(windowing, Windowing):
+                self.window = windowing.window
+                self._whole_images["start"] = windowing.start
+                self.n_traced += 3
+            self._is_prepared = True
+        if self.window not in self.clean_matrix.predictors:
+            u = self.problem.domain.start
+            predictor = self._make_predictor(u, "start", 0, tick)
+            self.clean_matrix.predictors[self.window] = predictor
 
     @property
     def start(self) -> Predictor:
         """The matrix of the clean configuration."""
         self.prepare()
-        assert self.clean_matrix.predictor is not None
-        return self.clean_matrix.predictor
+        return self.clean_matrix.predictors[self.window]
 
     def measure_size(self) -> tuple[int, int]:
         return self.start.n_entries, self.start.n_bytes
@@ -292,7 +319,12 @@ class Transport(PredictedSearch):
         """Compute the matrix at u (d,)."""
         with self.count_time():
             seed = seeds.stream(self.problem.seed, f"transport {kind}", number)
-            predictor = make_predictor(self.problem.renderer, u, seed, tick)
+            renderer = self.problem.renderer
+            if self.window is not None:
+                base_seed = seeds.stream(seed, "surroundings")
+                renderer = renderer.crop_to(self.window, u, base_seed, SURROUNDINGS_SPP)
+                self.n_traced += 1
+            predictor = make_predictor(renderer, u, seed, tick)
         self.n_traced += predictor.n_traced_images
         return predictor
 
@@ -309,10 +341,13 @@ class Transport(PredictedSearch):
         return replace(evaluation, predicted=1)
 
     def _update_predictor(self, query: Query) -> Predictor | None:
-        """Return the predictor of a query; None where it is traced.
+        """Return the predictor of a query; None if its image is traced.
 
-        Where that is due, the predictor is compared with traced images and, if it is
-        too far off, computed again.
+        Queries of the ranking and trials are traced. Every `COMPARISON_INTERVAL`
+        queries of a search the predictor is compared with traced images. If it is too
+        far off, it is computed again at the query's configuration; a predictor by basis
+        images of lights, which would be the same again, is given up and the rest of the
+        search is traced.
         """
         kind = query.kind
         number = query.number
@@ -322,15 +357,20 @@ class Transport(PredictedSearch):
         if number == 0 or number % COMPARISON_INTERVAL or not kind.startswith("search"):
             return predictor
         seed = seeds.stream(self.problem.seed, "transport check", number)
+        renderer = self.problem.renderer
+        if self.window is not None:
+            renderer = renderer.copy_with(crop=predictor.path_renderer.crop)
         deviation = self.compare(
             lambda view: self.problem.compare_view(
                 predictor,
                 query.u,
                 seeds.stream(seed, "view", view),
                 self.problem.spp,
+                renderer=renderer,
             )
         )
-        if deviation.is_accepted:
+        has_same_surroundings = self._has_same_surroundings(kind, query.u)
+        if deviation.is_accepted and has_same_surroundings:
             return predictor
         # Basis images of lights do not depend on u: nothing can be linearised again.
         if self.start.n_entries == 0:
@@ -339,6 +379,22 @@ class Transport(PredictedSearch):
         self._current[kind] = self._make_predictor(query.u, kind, number)
         self.n_renewals = (self.n_renewals or 0) + 1
         return self._current[kind]
+
+    def _has_same_surroundings(self, kind: str, u: Tensor) -> bool:
+        """Return whether what is outside of the window is still the same at u (d,).
+
+        If not, the matrix is computed again, and what is outside with it.
+        """
+        if self.window is None:
+            return True
+        before = self._whole_images.setdefault(kind, self._whole_images["start"])
+        with self.count_time():
+            whole = render_whole(self.problem, u)
+            deviation = measure_outside(self.problem, self.window, before, [whole])
+        self.n_traced += 1
+        if not deviation.is_accepted:
+            self._whole_images[kind] = whole
+        return deviation.is_accepted
 
     def is_likely_success(self, u: Tensor) -> bool:
         """Return whether the predicted image of u (d,) would pass its trials.
@@ -353,9 +409,8 @@ class Transport(PredictedSearch):
         The bias is the predicted score minus the lower end of the trials' scores.
         """
         if len(scores) >= MIN_SCORES and all(map(math.isfinite, scores)):
-            lower_end = statistics.fmean(
-                scores
-            ) - LOWER_END_DEVIATIONS * statistics.stdev(scores)
+            mean = statistics.fmean(scores)
+            lower_end = mean - LOWER_END_DEVIATIONS * statistics.stdev(scores)
             self._score_bias = self._predict_score(u) - lower_end
 
     def _predict_score(self, u: Tensor) -> float:

@@ -49,6 +49,7 @@ Interval = tuple[JsonFloat, JsonFloat]  # both ends of a 95 % interval
 
 
 def key_validator(*names: str) -> AfterValidator:
+    """Return a validator of a mapping that must have these keys."""
 
     def check(values: Mapping[str, object]) -> Mapping[str, object]:
         missing = [name for name in names if name not in values]
@@ -609,7 +610,8 @@ class PredictionError(Fields):
     """How far predicted pictures were from traced ones, at the last comparison."""
 
     levels: JsonFloat = Field(
-        description="of 255, over the object's pixels, root mean square"
+        description="of 255, over the object's pixels (of a crop, over those outside), "
+        "root mean square"
     )
     logits: JsonFloat = Field(
         description="of the margin, the mean over the pictures that were compared"
@@ -636,11 +638,16 @@ class LinearTransport(Fields):
 
     used: bool
     way: str | None = optional_field(
-        "by what: `matrix`, `basis pictures` (of a sweep), or `surface light`"
+        "by what: `matrix`, `basis pictures` (of a sweep), `surface light`, or `crop`, "
+        "which renders a part of each picture"
     )
     reason: str | None = optional_field(
         "why pictures were rendered, all or from some evaluation on, or not predicted "
         "by surface light"
+    )
+    crop: str | None = optional_field("why whole pictures were rendered")
+    window: tuple[int, int, int, int] | None = optional_field(
+        "the part of the picture that was traced: top, left, height and width"
     )
     conditions: BankOfConditions | None = optional_field("with `over`")
     entries: int | None = optional_field("of the matrix")

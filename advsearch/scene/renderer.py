@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -43,9 +43,11 @@ from advsearch.scene.gradients import (
     forbid_second_derivatives,
     make_first_plan,
 )
-from advsearch.scene.mitsuba_backend.denoise import denoise
+from advsearch.scene.image_quality import blur_image
+from advsearch.scene.mitsuba_backend.denoise import denoise_image
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.rig import Mount
+from advsearch.scene.window import Window
 
 MAX_SPP = 65536
 # a point of the unit box
@@ -55,7 +57,8 @@ Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
 Predict = Callable[[Mapping[str, Tensor]], Tensor]
 """From scene inputs to linear radiance (H, W, 3); differentiable.
 
-It is (H, W, 4) with coverage where there is a backdrop.
+It is (H, W, 4) with coverage where there is a backdrop, and (H, W, 7) with the change
+of the plane that takes the shadow in a photograph.
 """
 
 
@@ -92,6 +95,14 @@ class InputSpace(InputMapping, Protocol):
         """
 
 
+class Crop(NamedTuple):
+    """A part of the image that is rendered, and what the rest of it shows."""
+
+    window: Window  # of the pixels that are rendered
+    # radiance (H, W, 3), or (H, W, 4) with coverage where there is a backdrop
+    surroundings: Tensor
+
+
 # largest group for which it is measured how far its coordinates move outlines
 MAX_MEASURED_SIZE = 64
 # fraction of the noise over which the tone curve is straight; see `Renderer.halves`
@@ -106,6 +117,7 @@ class Renderer:
         plan: how each coordinate is differentiated; may be replaced.
         routes: which scene inputs each group of coordinates reaches, by
             `control.parameter`.
+        crop: what is rendered of each image; None for all of it.
         renders: number of primal renders so far, those of differences included.
         gradients: number of adjoint renders so far.
         non_finite: number of pixels and gradient entries that were NaN or infinite and
@@ -141,6 +153,7 @@ class Renderer:
         self._shape = space.start.shape
         self._source: Source | None = None
         self._predict: Predict | None = None
+        self.crop: Crop | None = None
         self.renders = self.gradients = self.non_finite = 0
         self._left_out: frozenset[str] = frozenset()
         groups = space.groups
@@ -186,6 +199,7 @@ class Renderer:
         *,
         source: Source | None = None,
         predict: Predict | None = None,
+        crop: Crop | None = None,
         **formation: Any,
     ) -> Renderer:
         """Return a renderer of the same space with some changes.
@@ -198,6 +212,7 @@ class Renderer:
             predict: predicts radiance (`scene.predictor`). Seed and samples of a call
                 mean nothing then, and every derivative runs back through scene inputs,
                 whatever the plan is.
+            crop: what is rendered of each image.
             formation: other fields of the image formation.
         """
         other = copy.copy(self)
@@ -205,7 +220,21 @@ class Renderer:
         other.scene = scene or self.scene
         other._source = source or self._source
         other._predict = predict or self._predict
+        other.crop = crop or self.crop
         return other
+
+    def crop_to(self, window: Window, u: Tensor, seed: int, spp: int) -> Renderer:
+        """Return a renderer that renders a window alone.
+
+        The rest of its images is that of u (d,), which is rendered now: arguments as
+        for a call. It does not count as a render.
+        """
+        with torch.no_grad():
+            inputs = self.scene.assembly(self.space.inputs(u))
+            surroundings = self.copy_with().render_radiance(
+                _select_scene_inputs(inputs), seed, spp, "backdrop.color" in inputs
+            )
+        return self.copy_with(crop=Crop(window, surroundings))
 
     def __call__(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
         """Render one or several configurations as the model would see them.
@@ -267,7 +296,7 @@ class Renderer:
         """
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
-            halves, mean = self._trace_halves(inputs, seed, spp)
+            halves, mean = self.trace_halves(inputs, seed, spp)
 
             def finish(radiance: Tensor) -> Tensor:
                 return self.finish_image(radiance, inputs, u, display=False)
@@ -287,14 +316,20 @@ class Renderer:
             second = display_straight(halves[1])
             return first, second, self.space.apply_to_image(u, curve_point)
 
-    def _trace_halves(
+    def trace_halves(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
     ) -> tuple[list[Tensor], Tensor]:
-        """Trace two renders with independent noise; return them and the denoised
-        mean.
+        """Trace the radiance of scene inputs twice, with independent noise.
+
+        Arguments as for a call. Nothing is counted.
+
+        Returns:
+            Both, which are not denoised, and their mean, which is: (H, W, 3), or
+            (H, W, 4) with coverage where there is a backdrop.
         """
         hide = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
+        window = self.crop.window if self.crop else None
         undenoised = self.copy_with(denoiser="none")
         noise_seeds = [seeds.stream(seed, "traced", half) for half in range(2)]
         halves = [
@@ -303,9 +338,14 @@ class Renderer:
         ]
         mean = (halves[0] + halves[1]) / 2.0
         guide_seed = seeds.stream(self.root_seed, "guides", noise_seeds[0])
-        albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
-        clean = denoise(mean[..., :3].contiguous(), albedo, normal)
-        return halves, torch.cat([clean, mean[..., 3:]], dim=-1)
+        with self.scene.limit_window(window):
+            albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
+        traced = mean if window is None else window.select(mean)
+        plane_radiance = self.scene.plane_radiance if hide else None
+        clean = denoise_image(traced, albedo, normal, plane_radiance)
+        if self.crop is not None:
+            clean = self.crop.window.paste(clean, self.crop.surroundings)
+        return halves, clean
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the inputs of Mitsuba's scene at a configuration (d,), without a
@@ -341,6 +381,11 @@ class Renderer:
             surfaces = self.scene.find_surfaces(
                 _select_scene_inputs(inputs), subdivision
             )
+            if "backdrop.front" in inputs:
+                is_hidden = inputs["backdrop.front"][..., 0] > 0.5
+                for dim in (0, 1):
+                    is_hidden = is_hidden.repeat_interleave(subdivision, dim)
+                surfaces.id[is_hidden] = 0
         metres = self.scene.definition[0].metres
         return replace(
             surfaces, depth=surfaces.depth * metres, z_depth=surfaces.z_depth * metres
@@ -385,7 +430,7 @@ class Renderer:
         noise_seed = seeds.stream(self.root_seed, "differences", seed)
         difference_spp = self.plan.spp or spp
         with torch.no_grad():
-            for group in self.plan.groups_with("secant"):
+            for group in self.plan.select_groups("secant"):
                 write_central_differences(
                     lambda at: loss(self._render_image(at, noise_seed, difference_spp)),
                     group,
@@ -512,19 +557,19 @@ class Renderer:
 
     @torch.no_grad()
     def _compute_denoising_change(self, exposed: Tensor, guides: Tensor) -> Tensor:
-        """Return by how much a denoiser changes radiance (H, W, 3 or 4).
+        """Return by how much a denoiser changes an image (H, W, 3, 4 or 7).
 
         `guides` are albedo and normals (H, W, 6).
         """
-        noisy = exposed[..., :3].contiguous()
-        clean = denoise(
-            noisy,
+        has_plane = exposed.shape[-1] > 4
+        clean = denoise_image(
+            exposed,
             guides[..., :3].contiguous(),
             guides[..., 3:].contiguous(),
+            self.scene.plane_radiance if has_plane else None,
             quick=self.formation.quick,
         )
-        no_coverage = torch.zeros_like(exposed[..., 3:])
-        return torch.cat([clean - noisy, no_coverage], dim=-1)
+        return clean - exposed
 
     def finish_image(
         self,
@@ -537,22 +582,52 @@ class Renderer:
         """Return the image of rendered radiance.
 
         Args:
-            rendered: radiance (H, W, 3), or (H, W, 4) with coverage.
+            rendered: radiance (H, W, 3), or (H, W, 4) with coverage, or (H, W, 7) with
+                the change of the plane that takes the shadow.
             inputs: scene inputs, of which exposure and backdrop are applied.
             u: configuration, for what controls do to the finished image.
             display: if False, return the radiance that is to be displayed.
         """
         exposure = inputs.get("camera.exposure")
         backdrop = inputs.get("backdrop.color")
+        if "backdrop.blur" in inputs:
+            rendered = blur_image(rendered, float(inputs["backdrop.blur"]))
         radiance = rendered[..., :3]
         if exposure is not None:
             radiance = radiance * torch.exp2(exposure)
         if backdrop is not None:
-            uncovered = (1.0 - rendered[..., 3:]).clamp(0.0, 1.0)
-            radiance = radiance + uncovered * (backdrop / self.formation.gain)
+            radiance = self._compose(radiance, rendered, inputs)
         if not display:
             return radiance
-        return self.space.apply_to_image(u, self.formation.display(radiance))
+        image = self.formation.display(radiance)
+        if "backdrop.noise" in inputs:
+            coverage = rendered[..., 3:4].detach()
+            if "backdrop.front" in inputs:
+                coverage = coverage * (1.0 - inputs["backdrop.front"])
+            image = (image + coverage * inputs["backdrop.noise"]).clamp(0.0, 1.0)
+        return self.space.apply_to_image(u, image)
+
+    def _compose(
+        self, radiance: Tensor, rendered: Tensor, inputs: Mapping[str, Tensor]
+    ) -> Tensor:
+        """Return radiance (H, W, 3) over its backdrop, see `advsearch.scene.backdrop`.
+
+        Args:
+            radiance: times its coverage.
+            rendered: the same with coverage and change of the plane.
+            inputs: of the scene.
+        """
+        behind = inputs["backdrop.color"] / self.formation.gain
+        shade = (1.0 - rendered[..., 3:4]).clamp(0.0, 1.0)
+        if "backdrop.plane" in inputs:
+            change = rendered[..., 4:] / inputs["backdrop.plane"]
+            shade = (shade + change).clamp_min(0.0)
+        composed = radiance + shade * behind
+        if "backdrop.front" not in inputs:
+            return composed
+        return torch.lerp(
+            composed, behind.expand_as(composed), inputs["backdrop.front"]
+        )
 
     def render_radiance(
         self,
@@ -575,13 +650,16 @@ class Renderer:
             denoised: denoise it if the formation requires it.
 
         Returns:
-            (H, W, 3), or (H, W, 4) with coverage if the environment is hidden.
+            (H, W, 3), or (H, W, 4) with coverage if the environment is hidden, or (H,
+            W, 7) with the change of the plane that takes the shadow in a photograph.
         """
         if self._predict is not None:
             return self._predict(inputs)
         radiance: Tensor = _Radiance.apply(  # type: ignore[no-untyped-call]
             self, tuple(inputs), seed, spp, hide_environment, denoised, *inputs.values()
         )
+        if self.crop is not None:
+            return self.crop.window.paste(radiance, self.crop.surroundings)
         return radiance
 
     def replace_non_finite(self, values: Tensor) -> Tensor:
@@ -596,7 +674,7 @@ class Renderer:
 
     def _groups_by_differences(self) -> tuple[Group, ...]:
         """Return the groups that use differences."""
-        return self.plan.groups_with(*(DIFFERENCE_ESTIMATORS - self._left_out))
+        return self.plan.select_groups(*(DIFFERENCE_ESTIMATORS - self._left_out))
 
     def compute_differences(
         self, u: Tensor, cotangent: Tensor, seed: int, spp: int
@@ -729,6 +807,7 @@ class _Radiance(torch.autograd.Function):
         ctx.seed = seed
         ctx.spp = spp
         ctx.hide = hide
+        ctx.window = renderer.crop.window if renderer.crop else None
         ctx.save_for_backward(*tensors)
         inputs = dict(zip(names, tensors, strict=True))
         noise_seed = seeds.stream(renderer.root_seed, "primal", seed)
@@ -740,16 +819,19 @@ class _Radiance(torch.autograd.Function):
             if denoised and renderer.formation.denoiser == "oidn":
                 guide_seed = seeds.stream(renderer.root_seed, "guides", seed)
                 image_seeds["guides"] = guide_seed
-            rendered, *guides = renderer.scene.render_images(inputs, image_seeds, spp)
+            with renderer.scene.limit_window(ctx.window):
+                rendered, *guides = renderer.scene.render_images(
+                    inputs, image_seeds, spp
+                )
         rendered = renderer.replace_non_finite(rendered)
         for guide in guides:
-            clean = denoise(
-                rendered[..., :3].contiguous(),
+            rendered = denoise_image(
+                rendered,
                 guide[..., :3],
                 guide[..., 3:],
+                renderer.scene.plane_radiance if hide else None,
                 quick=renderer.formation.quick,
             )
-            rendered = torch.cat([clean, rendered[..., 3:]], dim=-1) if hide else clean
         renderer.renders += 1
         return rendered
 
@@ -764,7 +846,7 @@ class _Radiance(torch.autograd.Function):
         renderer: Renderer = ctx.renderer
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
         noise_seed = seeds.stream(renderer.root_seed, "gradient", ctx.seed)
-        cotangent = renderer.replace_non_finite(cotangent[..., :3])
+        cotangent = renderer.replace_non_finite(cotangent)
         by_input = dict[str, Tensor]()
         remaining = list(inputs)
         # what two reach goes to the more general one
@@ -777,13 +859,14 @@ class _Radiance(torch.autograd.Function):
             if estimator == "material":
                 meshes = sorted({name.rpartition(".")[0] for name in wrt})
                 gradients = renderer.scene.render_material_adjoint(
-                    inputs, cotangent, noise_seed, ctx.spp, meshes=meshes
+                    inputs, cotangent[..., :3], noise_seed, ctx.spp, meshes=meshes
                 )
             else:
                 method = "hidden" if ctx.hide else "path"
-                gradients = renderer.scene.render_adjoint(
-                    inputs, cotangent, noise_seed, ctx.spp, wrt=wrt, method=method
-                )
+                with renderer.scene.limit_window(ctx.window):
+                    gradients = renderer.scene.render_adjoint(
+                        inputs, cotangent, noise_seed, ctx.spp, wrt=wrt, method=method
+                    )
             renderer.gradients += 1
             for name, gradient in gradients.items():
                 by_input[name] = renderer.replace_non_finite(gradient)
@@ -797,7 +880,7 @@ def _reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:
     Of the interior adjoint, only those that it differentiates correctly count.
     """
     reached: frozenset[str] = frozenset()
-    for group in renderer.plan.groups_with(estimator):
+    for group in renderer.plan.select_groups(estimator):
         reached |= renderer.routes.get(group.name, frozenset())
     return (
         reached & renderer.scene.interior_inputs if estimator == "adjoint" else reached

@@ -58,9 +58,9 @@ def test_a_wall_is_lit_by_the_beam_as_its_formula_says(kind: str) -> None:
     """A wall 25 m ahead of one lamp, 0.5 white: radiance = 0.5 / pi I cos / d^2, and the cut-off 25 cm below."""
     mi = import_mitsuba()
     lamp = next(one for one in beams(scene(**{"object.lamps": kind}).description) if "left" in one.name)
-    seat = np.eye(4)
-    seat[:3, :3] = lamp.seat[:3, :3]
-    lamp = BeamLamp("lamp", "", seat, lamp.table, (1.0, 1.0, 1.0), to_world=seat)
+    pose = np.eye(4)
+    pose[:3, :3] = lamp.pose_on_carrier[:3, :3]
+    lamp = BeamLamp("lamp", "", pose, lamp.table, (1.0, 1.0, 1.0), to_world=pose)
     view = mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[1, 0, -0.02], up=[0, 0, 1])
     made = mi.load_dict({
         "type": "scene", "lamp": translate_part(lamp).plugins["lamp"], "integrator": {"type": "prb", "max_depth": 2},

@@ -130,6 +130,22 @@ def test_the_transpose_is_one() -> None:
     assert forward == pytest.approx(float((change * made.multiply_transposed(cotangent)).sum()), rel=1e-5)
 
 
+@pytest.mark.parametrize(("texture", "bytes_an_entry"), [((256, 256), 4), ((257, 256), 6)])
+def test_what_is_kept_small_says_the_same(texture: tuple[int, int], bytes_an_entry: int) -> None:
+    """A column takes 16 bits, where 65,536 texels are not too many for that."""
+    seen = [vertices([(0, 0.3, 0.3, 1.0), (0, 0.999, 0.999, 3.0), (1, 0.7, 0.2, 1.0)])]
+    made, small = (TextureTransport((1, 2), texture, small=one) for one in (False, True))
+    for one in (made, small):
+        one.add_pass(seen, fraction=1.0)
+        one.finish()
+    change = torch.rand(*texture, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(small.multiply(change), made.multiply(change), rtol=HALF, atol=0.0)
+    cotangent = torch.ones(1, 2, 3)
+    both = small.multiply_transposed(cotangent), made.multiply_transposed(cotangent)
+    torch.testing.assert_close(*both, rtol=2 * HALF, atol=1e-6)
+    assert small.bytes == bytes_an_entry * small._sharp.entries + 2 * (4 + 6) * 2
+
+
 def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for() -> None:
     made = TextureTransport((1, 2), (CELL_SIZE, CELL_SIZE))
     made.add_pass([vertices([(0, 0.3, 0.3, 1.0), (0, 0.8, 0.3, 3.0), (1, 0.3, 0.3, 1.0)])], fraction=1.0)

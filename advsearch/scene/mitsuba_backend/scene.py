@@ -20,6 +20,7 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.scene.assembly import Assembly
+from advsearch.scene.backdrop import compute_plane_radiance
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import (
     ALL_OMISSIONS,
@@ -51,6 +52,7 @@ from advsearch.scene.mitsuba_backend.variant import (
 )
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_TYPE
 from advsearch.scene.parts import PATTERN_SUFFIX, Lamp, LampGlass, iterate_plugins
+from advsearch.scene.window import Window
 
 MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
 NO_ROULETTE_DEPTH = 1000
@@ -76,9 +78,12 @@ class MitsubaScene:
         definition: the description, and the filter.
         input_names: every input that can be set.
         parameters: Mitsuba's own.
+        plane_radiance: (3,) of the plane that takes the shadow in a photograph, without
+            the object; None if there is none.
         roulette_depth: segments of a light path after which Russian roulette starts.
         declared_inputs: for each input its key in `parameters`, and its definition.
         interior_inputs: the inputs that the interior adjoint differentiates correctly.
+        window: the window of the image that is rendered; None for all of it.
 
     Args:
         description: the scene.
@@ -115,8 +120,9 @@ class MitsubaScene:
             self.definition = (description, filter)
             self.resolution = resolution
             self.sampler = sampler
-            self.assembly = Assembly(description)
+            self.assembly = Assembly(description, resolution)
             self.max_depth = self.depth = max_depth
+            self.window: Window | None = None
             self._leave_out = frozenset(leave_out)
             # Dr.Jit can record neither of these
             unrecorded = description.thin_lens or any(
@@ -130,12 +136,15 @@ class MitsubaScene:
                 not description.thin_lens and description.camera_model is None
             )
             self._backdrop = description.backdrop
+            self.plane_radiance = compute_plane_radiance(description)
             if description.backdrop and description.has_emission:
+                behind = "the plain background"
+                if description.backdrop_photograph is not None:
+                    behind = "the photograph"
                 raise InputError(
                     "background: Mitsuba hides surfaces that emit light together with "
-                    "the environment; leave the plain "
-                    "background out, or take an object and surroundings without "
-                    "emission"
+                    f"the environment; leave {behind} out, or take an object and "
+                    "surroundings without emission"
                 )
             self._guides: Plugin = {
                 "type": "aov",
@@ -260,6 +269,44 @@ class MitsubaScene:
         finally:
             self.depth = depth_before
 
+    @contextmanager
+    def limit_window(self, window: Window | None) -> Iterator[None]:
+        """Render a window of the image alone inside the `with`, if it is not None."""
+        window_before = self.window
+        self.window = window
+        try:
+            yield
+        finally:
+            self.window = window_before
+
+    @property
+    def window_size(self) -> tuple[int, int]:
+        """Height and width of what is rendered, in pixels."""
+        if self.window is None:
+            return self.resolution
+        return self.window.height, self.window.width
+
+    @contextmanager
+    def _crop_film(self) -> Iterator[None]:
+        """Crop the camera's film to the window inside the `with`."""
+        if self.window is None:
+            yield
+            return
+        self._write_crop(self.window)
+        try:
+            yield
+        finally:
+            self._write_crop(Window(0, 0, *self.resolution))
+
+    def _write_crop(self, window: Window) -> None:
+        """Set which window of the image the camera's film has."""
+        film = "camera.film"
+        size = mi.ScalarVector2u(window.width, window.height)
+        self.parameters[f"{film}.crop_size"] = size
+        offset = mi.ScalarPoint2u(window.left, window.top)
+        self.parameters[f"{film}.crop_offset"] = offset
+        self.parameters.update()
+
     def round_sample_count(self, samples: float, sampler: str | None = None) -> int:
         """Return how many samples the sampler takes when at least `samples` are needed.
 
@@ -293,12 +340,14 @@ class MitsubaScene:
             spp: samples per pixel.
 
         Returns:
-            For each of `seeds` (H, W, 3) float32; of a scene with a backdrop (H, W, 4)
-            with the coverage of its surfaces; of "guides" (H, W, 6), the first hit's
-            albedo in [0, 1] and its shading normal.
+            For each of `seeds` (H, W, 3) float32, of the window if there is one; of a
+            scene with a backdrop (H, W, 4) with the coverage of its surfaces, or with a
+            plane that takes the shadow in a photograph (H, W, 7), where the last three
+            are the change of the plane's radiance; of "guides" (H, W, 6), the first
+            hit's albedo in [0, 1] and its shading normal.
         """
         INTERRUPTS.look()
-        with mitsuba_lock:
+        with mitsuba_lock, self._crop_film():
 
             def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
                 image = integrator.render(
@@ -325,7 +374,7 @@ class MitsubaScene:
             ):
                 function: Callable[..., Any] = render
                 if self._freeze:
-                    key = (method, spp, self.depth)
+                    key = (method, spp, self.depth, self.window)
                     function = self._recorded.get_or_record(key, render, media)
                 drjit_image = function(
                     self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)
@@ -410,7 +459,8 @@ class MitsubaScene:
 
         Args:
             inputs: as in `radiance`.
-            cotangent: (H, W, 3) float32.
+            cotangent: (H, W, 3) float32, or of as many channels as the image has; of
+                the window if there is one.
             seed: should differ from the primal's, or the gradient of a noisy image is
                 returned.
             spp: independent samples per pixel.
@@ -435,13 +485,17 @@ class MitsubaScene:
             if "boundary" not in self._leave_out and has_boundary:
                 method = "boundary"
                 extra = extra | self._buffers
-            image_gradient = cotangent.detach().to(torch.float32).contiguous()
-            if self._backdrop:
-                no_coverage = torch.zeros_like(image_gradient[..., :1])
-                image_gradient = torch.cat([image_gradient, no_coverage], dim=-1)
+            image_gradient = cotangent.detach().to(torch.float32)
+            color_gradient = image_gradient[..., :3]
+            if self._backdrop:  # coverage has no derivative
+                n_others = 1 if self.plane_radiance is None else 4
+                others = torch.zeros(*image_gradient.shape[:2], n_others)
+                others[..., 1:] = image_gradient[..., 4:]
+                color_gradient = torch.cat([color_gradient, others], dim=-1)
+            image_gradient = color_gradient.contiguous()
             self._set(inputs)
             names = (*sorted(extra - set(requested)), *requested)
-            with self._tracked(names, inputs) as tracked:
+            with self._tracked(names, inputs) as tracked, self._crop_film():
                 self._integrator(method).render_backward(
                     self._scene,
                     self.parameters,
@@ -544,13 +598,13 @@ class MitsubaScene:
         Their vertices have the change of their pixel for a unit more of the input, and
         the paths have an image. Other arguments as for `pictures`.
         """
-        with mitsuba_lock:
+        with mitsuba_lock, self._crop_film():
             self._set(inputs)
             key = self.declared_inputs[name][0]
             spp = self.round_sample_count(spp)
             noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
             noise.set_samples_per_wavefront(spp)
-            height, width = self.resolution
+            height, width = self.window_size
             noise.seed(dr.opaque(mi.UInt32, seed), height * width * spp)
             part = name.partition(".")[0]
             projector = None
@@ -562,10 +616,11 @@ class MitsubaScene:
                 self.parameters,
                 key,
                 noise,
-                self.resolution,
+                self.window_size,
                 self.depth,
                 spp,
                 projector,
+                self._find_plane(),
             )
             size = self.parameters[key].shape[:2]
             surface = None
@@ -580,6 +635,13 @@ class MitsubaScene:
             return replace(paths, vertices=vertices)
 
     # ---- implementation
+
+    def _find_plane(self) -> Any:
+        """Return Mitsuba's shape of the plane that takes the shadow, or None."""
+        if self.plane_radiance is None:
+            return None
+        shapes = {shape.id(): shape for shape in self._scene.shapes()}
+        return shapes[parts.GROUND_NAME]
 
     def _set(self, inputs: Mapping[str, Tensor]) -> None:
         """Set exactly these inputs, and everything else to its base value.
@@ -677,9 +739,12 @@ class MitsubaScene:
                 "rr_depth": self.roulette_depth,
                 **self._path,
             }
+            hidden = {**path, "hide_emitters": True}
+            if self.plane_radiance is not None:
+                hidden["type"] = "advsearch_photograph"
             recipes: dict[str, Plugin] = {
                 "path": path,
-                "hidden": {**path, "hide_emitters": True},
+                "hidden": hidden,
                 "guides": self._guides,
                 "boundary": {
                     "type": "prb_projective",

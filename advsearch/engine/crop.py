@@ -1,0 +1,139 @@
+"""Searches that render only the window of the image in which something can change.
+
+The rest of each image is that of a whole one. It is rendered again every
+`COMPARISON_INTERVAL` evaluations, which also measures what was missed. Where this is
+too much twice in a row, the rest of the search renders whole images. The ranking and
+all trials do so anyway. How the window is chosen: `advsearch.engine.windows`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks import Evaluation
+from advsearch.attacks.evaluation import Query
+from advsearch.engine.transport import COMPARISON_INTERVAL, PredictedSearch
+from advsearch.engine.windows import (
+    PROBE_SPP,
+    WholeImage,
+    Windowing,
+    find_window,
+    measure_outside,
+    render_whole,
+)
+from advsearch.scene.predictor import Refusal
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.matrix import ProgressCallback
+
+
+@dataclass
+class CroppedSearch(PredictedSearch):
+    """The window of a run's searches, and what is around it.
+
+    Attributes:
+        windowing: the window; None before it is chosen, or if there is none.
+        refusal: why there is none.
+    """
+
+    method: ClassVar[str] = "crop"
+    title: ClassVar[str] = "finding the part of the picture that can change"
+    what_it_renders: ClassVar[str] = "renders that part alone"
+
+    windowing: Windowing | None = None
+    refusal: Refusal | None = None
+    # the latest whole image of each kind of search, and the renderer with that around
+    _current: dict[str, tuple[WholeImage, Renderer]] = field(default_factory=dict)
+
+    @property
+    def n_samples(self) -> int:
+        return 6 * PROBE_SPP
+
+    @property
+    def accuracy_refusal(self) -> Refusal | None:
+        return self.refusal
+
+    def measure_size(self) -> tuple[int, int]:
+        height, width = self.problem.renderer.formation.resolution
+        n_images = 4 * len(self._current)  # of float32
+        return 0, 4 * 3 * height * width * n_images
+
+    def count_predicted(self, kind: str, evaluations: int) -> int:
+        return 0  # they are rendered
+
+    def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
+        """Choose the window, and render the surroundings at the start."""
+        with self.count_time():
+            windowing = find_window(self.problem)
+            if isinstance(windowing, Refusal):
+                self.refusal = windowing
+                return
+            self.windowing = windowing
+            self.window = windowing.window
+            self.deviations.append(windowing.deviation)
+            tick(self.n_samples)
+            self.n_traced += 3
+            self._use(windowing, "start", 0, windowing.start)
+
+    def _use(
+        self, windowing: Windowing, kind: str, number: int, image: WholeImage
+    ) -> Renderer:
+        """Render the surroundings that a kind of search has from now on."""
+        problem = self.problem
+        seed = seeds.stream(problem.seed, f"crop {kind}", number)
+        with problem.renderer.scene.limit_depth(problem.search_depth):
+            renderer = problem.renderer.crop_to(
+                windowing.window, image.u, seed, problem.spp
+            )
+        self.n_traced += 1
+        self._current[kind] = image, renderer
+        return renderer
+
+    def replay(self, query: Query) -> None:
+        self._update(query)
+
+    def evaluate(self, query: Query) -> Evaluation:
+        renderer = self._update(query)
+        if renderer is None:
+            return self.problem.evaluate(query)
+        return self.problem.evaluate_full(query, query.u, query.seed, renderer)[0]
+
+    def _update(self, query: Query) -> Renderer | None:
+        """Return the renderer of a query; None where whole images are rendered.
+
+        Where that is due, a whole image is rendered, measured and used.
+        """
+        kind = query.kind
+        number = query.number
+        first_whole = self.first_traced.get(kind, self.steps)
+        if query.phase != "search" or number >= first_whole:
+            return None
+        if self.windowing is None:
+            self.prepare()
+        assert self.windowing is not None
+        image, renderer = self._current.setdefault(kind, self._current["start"])
+        if number == 0 or number % COMPARISON_INTERVAL or not kind.startswith("search"):
+            return renderer
+        was_accepted = self.deviations[-1].is_accepted
+        with self.count_time():
+            whole = self._measure(self.windowing, image, query.u)
+            if self.deviations[-1].is_accepted or was_accepted:
+                self.n_renewals = (self.n_renewals or 0) + 1
+                return self._use(self.windowing, kind, number, whole)
+        self.trace_from(kind, number, f" of the {kind}")
+        return None
+
+    def _measure(
+        self, windowing: Windowing, image: WholeImage, u: Tensor
+    ) -> WholeImage:
+        """Measure how far the surroundings of an image are off at u (d,), and return
+        the whole image there.
+        """
+        whole = render_whole(self.problem, u)
+        self.n_traced += 1
+        deviation = measure_outside(self.problem, windowing.window, image, [whole])
+        self.deviations.append(deviation)
+        return whole

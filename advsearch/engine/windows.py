@@ -1,0 +1,283 @@
+"""Find the window of the image outside of which what is searched changes nothing.
+
+What is searched may show in a small part of the image. A search then traces the
+smallest window around it for which this holds: outside, whole images at both ends of
+the budget differ from that of the start by less than `MAX_LEVELS` on average, and with
+these surroundings the margin is as without (docs/leaving-out.md, "The rest of the
+picture").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from advsearch import seeds
+from advsearch.engine.acceptance import (
+    ACCEPTED_FRACTION,
+    MAX_BIAS_FRACTION,
+    MAX_MARGIN_BIAS,
+    Deviation,
+)
+from advsearch.engine.problem import Problem
+from advsearch.scene.assembly import IMAGE_INPUTS
+from advsearch.scene.predictor import NOISE, Refusal, RefusalCause
+from advsearch.scene.surface.renderer import find_changed_inputs
+from advsearch.scene.transport.lights import HAZE, find_light_inputs
+from advsearch.scene.window import Window
+
+MIN_STEPS = 16  # evaluations of a search from which on a crop pays
+MAX_AREA = 0.3  # largest window that pays, as a fraction of the image
+MAX_LEVELS = 0.1
+"""Difference outside of the window that is allowed, in levels of 255.
+
+It is the root mean square of the means over squares of `SQUARE` pixels.
+"""
+SQUARE = 8
+MARGINS = (8, 16, 24, 32, 48, 64, 96, 128)  # pixels around the box, smallest first
+PROBE_SPP = 2
+"""Samples per pixel of each half of a whole image that is compared with others.
+
+Few are enough: images of one seed have nearly the same noise.
+"""
+MOVING_SUFFIXES = (".vertices", ".normals")
+
+
+class WholeImage(NamedTuple):
+    """A whole image, traced twice with independent noise.
+
+    Attributes:
+        u: (d,) its configuration.
+        halves: both, linear radiance (H, W, 3 or 4) with noise.
+        radiance: their mean (H, W, 3 or 4), denoised.
+    """
+
+    u: Tensor
+    halves: Sequence[Tensor]
+    radiance: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Windowing:
+    """A window, and how far images of the ends of the budget are off outside of it.
+
+    Attributes:
+        window: of the pixels that are traced.
+        start: the whole image at the start.
+        deviation: of images with its surroundings.
+    """
+
+    window: Window
+    start: WholeImage
+    deviation: Deviation
+
+
+def find_window(problem: Problem) -> Windowing | Refusal:
+    """Return the smallest window outside of which a search changes little.
+
+    It takes three whole images of few samples. Without one, why there is none.
+    """
+    refusal = find_crop_refusal(problem)
+    if refusal is not None:
+        return refusal
+    domain = problem.domain
+    resolution = problem.renderer.formation.resolution
+    largest_area = MAX_AREA * resolution[0] * resolution[1]
+    box = _find_box(problem)
+    if box is None:
+        return Refusal("nothing of what is searched is in the picture")
+    if box.grow(MARGINS[0], resolution).area > largest_area:
+        return Refusal("what is searched fills much of the picture")
+    lower = domain.project(torch.zeros_like(domain.start))
+    upper = domain.project(torch.ones_like(domain.start))
+    start, *ends = [render_whole(problem, u) for u in (domain.start, lower, upper)]
+    for margin in MARGINS:
+        window = box.grow(margin, resolution)
+        if window.area > largest_area:
+            break
+        deviation = measure_outside(problem, window, start, ends)
+        if deviation.is_accepted:
+            return Windowing(window, start, deviation)
+    return Refusal(f"its surroundings change with it: {_describe(deviation)}")
+
+
+def find_crop_refusal(problem: Problem) -> Refusal | None:
+    """Return why a search renders whole images; None if a crop may be enough.
+
+    What it misses outside is measured only then.
+    """
+    renderer = problem.renderer
+    if renderer.composition_reason:
+        return Refusal(renderer.composition_reason)
+    if problem.conditions is not None:
+        return Refusal("the surroundings of each picture are others")
+    if problem.steps < MIN_STEPS:
+        return Refusal(
+            f"a crop pays from {MIN_STEPS} evaluations on", RefusalCause.TOO_FEW_STEPS
+        )
+    if renderer.scene.is_volumetric:
+        return HAZE
+    if renderer.scene.definition[0].camera_model is not None:
+        return Refusal("the camera has a lens of its own")
+    if renderer.formation.denoiser != "oidn":
+        return NOISE
+    return _find_searched_refusal(problem)
+
+
+def _find_searched_refusal(problem: Problem) -> Refusal | None:
+    """Return why what is searched shows in more than a part of the image."""
+    light_inputs = find_light_inputs(problem.renderer)
+    names = _find_searched_inputs(problem)
+    if not names:
+        return Refusal("nothing that is searched needs a render")
+    shapes = problem.renderer.surfaces(problem.renderer.start).names
+    for name in sorted(names):
+        part = name.partition(".")[0]
+        if name in light_inputs:
+            return Refusal(f"{part} is light, which shows everywhere")
+        if name.endswith(MOVING_SUFFIXES):
+            return Refusal(f"{part} moves")
+        if part not in shapes:
+            return Refusal(f"{part} shows in more than a part of the picture")
+    return None
+
+
+def _find_searched_inputs(problem: Problem) -> frozenset[str]:
+    """Return the scene inputs that are searched."""
+    names = [control.name for control in problem.searched_space.controls]
+    return find_changed_inputs(problem.renderer, names) - IMAGE_INPUTS
+
+
+def _find_box(problem: Problem) -> Window | None:
+    """Return the box of all that is searched, at the start; None if it is not seen."""
+    surfaces = problem.renderer.surfaces(problem.domain.start)
+    mask = torch.zeros(problem.renderer.formation.resolution, dtype=torch.bool)
+    for name in _find_searched_inputs(problem):
+        mask |= surfaces.visible_mask(name.partition(".")[0])
+    return Window.from_mask(mask)
+
+
+def render_whole(problem: Problem, u: Tensor) -> WholeImage:
+    """Render the whole image of u (d,) that is compared with others.
+
+    It has the same noise for each u.
+    """
+    with torch.no_grad(), problem.renderer.scene.limit_depth(problem.search_depth):
+        halves, radiance = problem.renderer.trace_halves(
+            _compute_inputs(problem, u), seeds.stream(problem.seed, "crop"), PROBE_SPP
+        )
+    return WholeImage(u.detach().clone(), halves, radiance)
+
+
+def _compute_inputs(problem: Problem, u: Tensor) -> dict[str, Tensor]:
+    """Return the scene inputs of u (d,)."""
+    return problem.renderer.scene.assembly(problem.space.inputs(u))
+
+
+def measure_outside(
+    problem: Problem, window: Window, before: WholeImage, others: Sequence[WholeImage]
+) -> Deviation:
+    """Measure by how much images differ outside of a window, the mean over several.
+
+    Args:
+        problem: of the search.
+        window: the pixels that are traced.
+        before: the image whose surroundings are pasted.
+        others: the images that are compared with it.
+    """
+    squares = []
+    biases = []
+    changes = []
+    for image in others:
+        squares.append(_measure_square(problem, window, before, image))
+        bias, change = _measure_margin(problem, window, before, image)
+        biases.append(bias)
+        changes.append(change)
+    count = len(others)
+    limit = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * sum(changes) / count)
+    return Deviation(
+        levels=math.sqrt(max(0.0, sum(squares) / count)),
+        logits=sum(biases) / count,
+        allowed_levels=MAX_LEVELS,
+        n_traced=count,
+        allowed_margin_bias=limit,
+    )
+
+
+def _measure_square(
+    problem: Problem, window: Window, before: WholeImage, after: WholeImage
+) -> float:
+    """Return the mean squared difference outside of a window, in squared levels.
+
+    Images of one seed have nearly the same noise. The product of the differences of two
+    seeds is the square without what noise is left.
+    """
+    outside = window.is_outside(problem.renderer.formation.resolution).float()
+    slope = _compute_slope(problem, before)
+    sums = [
+        _sum_squares(255.0 * slope * (new - old)[..., :3] * outside[..., None])
+        for old, new in zip(before.halves, after.halves, strict=True)
+    ]
+    n_pixels = _sum_squares(outside[..., None])
+    products = sums[0] * sums[1] / n_pixels.clamp_min(1.0)
+    return float(products.sum() / (3.0 * n_pixels.sum().clamp_min(1.0)))
+
+
+def _sum_squares(image: Tensor) -> Tensor:
+    """Return the sums over squares of `SQUARE` pixels of an image (H, W, c)."""
+    sums: Tensor = functional.avg_pool2d(
+        image.movedim(-1, 0)[None], SQUARE, ceil_mode=True, divisor_override=1
+    )
+    return sums
+
+
+def _compute_slope(problem: Problem, image: WholeImage) -> Tensor:
+    """Return the derivative of the displayed image by its radiance, (H, W, 3)."""
+    radiance = image.radiance.clone()
+    inputs = _compute_inputs(problem, image.u)
+    with torch.enable_grad():
+        radiance.requires_grad_()
+        linear = problem.renderer.finish_image(radiance, inputs, image.u, display=False)
+        displayed = problem.renderer.formation.display(linear)
+        (slope,) = torch.autograd.grad(displayed.sum(), radiance)
+    return slope[..., :3]
+
+
+def _measure_margin(
+    problem: Problem, window: Window, before: WholeImage, after: WholeImage
+) -> tuple[float, float]:
+    """Return how much larger the margin is with the surroundings of another image, and
+    by how much it has moved from that image.
+    """
+    pasted = window.paste(window.select(after.radiance), before.radiance)
+    margin = _compute_margin(problem, after.radiance, after.u)
+    bias = _compute_margin(problem, pasted, after.u) - margin
+    change = margin - _compute_margin(problem, before.radiance, before.u)
+    return bias, abs(change)
+
+
+def _compute_margin(problem: Problem, radiance: Tensor, u: Tensor) -> float:
+    """Return the model's margin on the image of radiance (H, W, 3 or 4)."""
+    with torch.no_grad():
+        inputs = _compute_inputs(problem, u)
+        image = problem.renderer.finish_image(radiance, inputs, u)
+        return problem.judge(image, u).margin
+
+
+def _describe(deviation: Deviation) -> str:
+    """Return how far a deviation is over its limits, for a sentence."""
+    if deviation.levels_fraction > ACCEPTED_FRACTION:
+        return (
+            f"by {deviation.levels:.2f} levels of 255, where "
+            f"{ACCEPTED_FRACTION * deviation.allowed_levels:.2f} would do"
+        )
+    return (
+        f"by {deviation.logits:+.2f} in the margin, where "
+        f"{deviation.allowed_margin_bias:.2f} would do"
+    )
