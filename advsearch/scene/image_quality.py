@@ -70,7 +70,7 @@ def _split_blocks(image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
         return image.reshape(1, -1)
     cut = image[: rows * BLOCK, : columns * BLOCK]
     blocks = cut.reshape(rows, BLOCK, columns, BLOCK).swapaxes(1, 2)
-    return blocks.reshape(rows * columns, -1)
+    return np.asarray(blocks.reshape(rows * columns, -1))
 
 
 def make_noise(sigma: Float64Array, size: tuple[int, int], seed: int) -> Tensor:

@@ -623,25 +623,20 @@ def _collect(
         for name, value in linearized_at.items()
     }
     has_backdrop = "backdrop.color" in image_inputs
-    if not transports:
+    if transports:
+        base = _trace_matrices(
+            renderer,
+            transports,
+            scene_inputs,
+            seed=seed,
+            tick=tick,
+            spp=spp,
+            quick=quick,
+            has_backdrop=has_backdrop,
+        )
+    else:
         base = renderer.render_radiance(scene_inputs, seed, spp, has_backdrop)
         tick(spp)
-    else:
-        window = renderer.crop.window if renderer.crop else None
-        with renderer.scene.limit_window(window):
-            paths = _fill_transports(
-                renderer, transports, scene_inputs, seed, tick, spp
-            )
-        radiance = paths.radiance - paths.background if has_backdrop else paths.radiance
-        radiance = renderer.replace_non_finite(radiance)
-        base, smooth = _make_smooth(renderer, radiance, paths, quick)
-        for transport in transports.values():
-            transport.finish(smooth)
-        if has_backdrop:
-            base = torch.cat([base, paths.coverage], dim=-1)
-            base = _append_plane_change(renderer, base, scene_inputs, seed, spp)
-        if renderer.crop is not None:
-            base = renderer.crop.window.paste(base, renderer.crop.surroundings)
     return LinearizedScene(
         transports=transports,
         linearized_at=linearized_at,
@@ -649,6 +644,38 @@ def _collect(
         base_image=PackedImage(base, is_small=quick),
         non_finite=renderer.non_finite - non_finite_before,
     )
+
+
+def _trace_matrices(
+    renderer: Renderer,
+    transports: Mapping[str, TextureTransport],
+    scene_inputs: Inputs,
+    *,
+    seed: int,
+    tick: ProgressCallback,
+    spp: int,
+    quick: bool,
+    has_backdrop: bool,
+) -> Tensor:
+    """Fill and finish empty matrices, and return the base image of the same paths.
+
+    A renderer that has a crop traces its window only; the rest is pasted. Other
+    arguments are those of `LinearRenderer`, and of `_collect`.
+    """
+    window = renderer.crop.window if renderer.crop else None
+    with renderer.scene.limit_window(window):
+        paths = _fill_transports(renderer, transports, scene_inputs, seed, tick, spp)
+    radiance = paths.radiance - paths.background if has_backdrop else paths.radiance
+    radiance = renderer.replace_non_finite(radiance)
+    base, smooth = _make_smooth(renderer, radiance, paths, quick)
+    for transport in transports.values():
+        transport.finish(smooth)
+    if has_backdrop:
+        base = torch.cat([base, paths.coverage], dim=-1)
+        base = _append_plane_change(renderer, base, scene_inputs, seed, spp)
+    if renderer.crop is not None:
+        base = renderer.crop.window.paste(base, renderer.crop.surroundings)
+    return base
 
 
 def _append_plane_change(
