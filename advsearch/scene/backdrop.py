@@ -107,6 +107,7 @@ class BackdropPhotograph:
 
     @property
     def is_cropped(self) -> bool:
+        """Whether only a part of the photograph is used."""
         return self.size != self.full_size
 
     def resample(self, resolution: tuple[int, int]) -> Tensor:

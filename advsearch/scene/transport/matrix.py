@@ -616,7 +616,7 @@ def _collect(
     }
     transports = {
         name: TextureTransport(
-            _traced_size(renderer),
+            _get_traced_size(renderer),
             (value.shape[0], value.shape[1]),
             small=quick,
         )
@@ -707,7 +707,7 @@ def _fill_transports(
     `TransportTooLargeError` as soon as all matrices take more than `MAX_BYTES`.
     """
     samples, n_passes = plan_passes(renderer, spp)
-    height, width = _traced_size(renderer)
+    height, width = _get_traced_size(renderer)
     images: list[Paths] = []
     for name, transport in transports.items():
         for index in range(n_passes):
@@ -760,7 +760,7 @@ def find_linear_inputs(renderer: Renderer) -> frozenset[str]:
     )
 
 
-def _traced_size(renderer: Renderer) -> tuple[int, int]:
+def _get_traced_size(renderer: Renderer) -> tuple[int, int]:
     """Return height and width of what is traced of an image, in pixels."""
     if renderer.crop is None:
         return renderer.formation.resolution
@@ -769,6 +769,6 @@ def _traced_size(renderer: Renderer) -> tuple[int, int]:
 
 def plan_passes(renderer: Renderer, spp: int) -> tuple[int, int]:
     """Return the samples per pixel of a pass, and the number of passes."""
-    height, width = _traced_size(renderer)
+    height, width = _get_traced_size(renderer)
     samples = max(1, min(spp, SAMPLES_PER_PASS // (height * width)))
     return samples, -(-spp // samples)
