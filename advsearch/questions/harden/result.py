@@ -269,6 +269,7 @@ class HardenResult(views.InNotebook, RunResult):
 
     @property
     def brief(self) -> str:
+        """How many scenes are robust after and before; empty if that is unknown."""
         if self.before is None or self.after is None:
             return ""
         return (

@@ -698,11 +698,11 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
 
 
 def _check_different(names: Sequence[str]) -> None:
+    """Check that no two models have the same name: results are listed by it."""
     if len(set(names)) < len(names):
         raise InputError(
             f"model: expected models with different names, got {', '.join(names)}; "
-            "from Python, "
-            "load_model(..., name=...) gives one"
+            "from Python, load_model(..., name=...) gives one"
         )
 
 

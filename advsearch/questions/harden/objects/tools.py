@@ -412,6 +412,7 @@ def _dumbbell_paints(
     if draw.chance(0.5, canonical=True):
 
         def on_both_ends(t: Texels) -> Array:
+            """Return the mask of a ring on the outer side of each weight."""
             ring = band_mask(
                 np.hypot(t.xyz[:, 0], t.xyz[:, 1]),
                 0.34 * radius,

@@ -622,6 +622,7 @@ def _vase_paint(
         )
 
     def scroll(texels: Texels) -> Array:
+        """Return the mask of curling petals around the belly."""
         angle = np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0])
         z = texels.xyz[:, 2] / height
         curl = np.abs(np.sin(3.0 * angle + 9.0 * np.sin(5.0 * z)))
@@ -631,6 +632,7 @@ def _vase_paint(
         )(texels)
 
     def frieze(texels: Texels) -> Array:
+        """Return the mask of a band of 16 teeth above the foot."""
         teeth = step(
             np.sin(16 * np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0])), 0.0, soft=0.5
         )
