@@ -620,8 +620,7 @@ def _collect(
         base = renderer.render_radiance(scene_inputs, seed, spp, has_backdrop)
         tick(spp)
     else:
-        window = renderer.crop.window if renderer.crop else None
-        with renderer.scene.limit_window(window):
+        with renderer.scene.limit_window(renderer.window):
             paths = _fill_transports(
                 renderer, transports, scene_inputs, seed, tick, spp
             )
