@@ -211,7 +211,7 @@ def read_backdrop(spec: str | Path) -> BackdropPhotograph:
     return make_backdrop(levels, text, crop)
 
 
-def find_photograph_light(photograph: object) -> Path | None:
+def find_photographed_light(photograph: object) -> Path | None:
     """Return the environment map that lies beside a photograph, or None.
 
     It is called as the photograph, with the suffix .hdr or .exr.

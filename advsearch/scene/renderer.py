@@ -223,6 +223,11 @@ class Renderer:
         other.crop = crop or self.crop
         return other
 
+    @property
+    def window(self) -> Window | None:
+        """Window of the image that is rendered; None for all of it."""
+        return self.crop.window if self.crop else None
+
     def crop_to(self, window: Window, u: Tensor, seed: int, spp: int) -> Renderer:
         """Return a renderer that renders a window alone.
 
@@ -329,7 +334,6 @@ class Renderer:
         """
         hide = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
-        window = self.crop.window if self.crop else None
         undenoised = self.copy_with(denoiser="none")
         noise_seeds = [seeds.stream(seed, "traced", half) for half in range(2)]
         halves = [
@@ -338,14 +342,14 @@ class Renderer:
         ]
         mean = (halves[0] + halves[1]) / 2.0
         guide_seed = seeds.stream(self.root_seed, "guides", noise_seeds[0])
-        with self.scene.limit_window(window):
+        with self.scene.limit_window(self.window):
             albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
-        traced = mean if window is None else window.select(mean)
         plane_radiance = self.scene.plane_radiance if hide else None
+        if self.crop is None:
+            return halves, denoise_image(mean, albedo, normal, plane_radiance)
+        traced = self.crop.window.select(mean)
         clean = denoise_image(traced, albedo, normal, plane_radiance)
-        if self.crop is not None:
-            clean = self.crop.window.paste(clean, self.crop.surroundings)
-        return halves, clean
+        return halves, self.crop.window.paste(clean, self.crop.surroundings)
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the inputs of Mitsuba's scene at a configuration (d,), without a
@@ -807,7 +811,7 @@ class _Radiance(torch.autograd.Function):
         ctx.seed = seed
         ctx.spp = spp
         ctx.hide = hide
-        ctx.window = renderer.crop.window if renderer.crop else None
+        ctx.window = renderer.window
         ctx.save_for_backward(*tensors)
         inputs = dict(zip(names, tensors, strict=True))
         noise_seed = seeds.stream(renderer.root_seed, "primal", seed)

@@ -26,6 +26,7 @@ from advsearch.scene.backdrop import (
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import camera_to_world, project_points
 from advsearch.scene.image_quality import blur_image, measure_blur, measure_noise
+from advsearch.scene.transport.matrix import LinearRenderer
 
 SIZE = (24, 32)
 NO_SHADOW = {"ground.size": 0.0}
@@ -167,6 +168,20 @@ def test_the_derivative_with_a_shadow_is_that_of_differences(tmp_path: Path, con
         with torch.no_grad():
             above, below = ((weights * render(u + step, 1, 256)).sum() for step in (0.03, -0.03))
         assert float(slope.sum()) == pytest.approx(float(above - below) / 0.06, rel=0.03, abs=0.02)
+
+
+@pytest.mark.medium
+def test_a_matrix_predicts_the_picture_in_a_photograph(tmp_path: Path) -> None:
+    Image.new("RGB", (32, 32), (120, 160, 90)).save(tmp_path / "a.png")
+    scene = advsearch.load_scene("mug", backdrop=tmp_path / "a.png")
+    render = scene.renderer({"texture": {"resolution": 8, "epsilon": 0.4}}, resolution=32)
+    predicted = LinearRenderer(render, render.start, 0, spp=64)
+    change = torch.rand(len(render.start), generator=torch.Generator().manual_seed(0)) - 0.5
+    u = (render.start + 0.3 * change).clamp(0, 1)
+    with torch.no_grad():
+        error = (predicted(u) - render(u, 3, 256)).abs().mean() * 255.0
+        noise = (render(u, 4, 256) - render(u, 3, 256)).abs().mean() * 255.0
+    assert error < 2.0 * noise + 0.5
 
 
 def test_light_and_ground_follow_from_the_photograph(tmp_path: Path) -> None:
