@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -282,7 +282,7 @@ def _read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _is_rows(value: object) -> bool:
+def _is_rows(value: object) -> TypeGuard[list[dict[str, Any]]]:
     return isinstance(value, list) and all(isinstance(row, dict) for row in value)
 
 
@@ -446,7 +446,7 @@ def _check_pose(matrix: Float64Array, where: str) -> Float64Array:
     left, _, right = np.linalg.svd(rotation)
     pose = matrix.copy()
     pose[:3, :3] = left @ right
-    return pose
+    return np.asarray(pose)
 
 
 def _make_pinhole(numbers: Float64Array, where: str) -> Pinhole:
