@@ -566,7 +566,7 @@ class LinearRenderer(Predictor):
         for name, transport in self.collected.transports.items():
             change = transport(inputs[name] - self.linearized_at[name])
             if crop is not None:
-                change = crop.window.pad(change, base.shape[:2])
+                change = crop.window.pad(change, (base.shape[0], base.shape[1]))
             radiance = radiance + change
         if base.shape[-1] == 3:
             return radiance
