@@ -423,6 +423,7 @@ def _fixed_domain(
     things = (str(getattr(result, "object", "") or ""), join_values(recorded, "things"))
     fixed["road users and things"].append("; ".join(filter(None, things)))
     fixed["camera and picture"].append(join_values(recorded, "camera"))
+    fixed["camera and picture"].append(join_values(recorded, "backdrop"))
     # each value once
     values = dict[tuple[str, str], None]()
     for run_settings in recorded:
