@@ -19,11 +19,11 @@ from advsearch.attacks.evaluation import Query
 from advsearch.engine.transport import COMPARISON_INTERVAL, PredictedSearch
 from advsearch.engine.windows import (
     PROBE_SPP,
-    WholeImage,
+    FullImage,
     Windowing,
     find_window,
     measure_outside,
-    render_whole,
+    render_full,
 )
 from advsearch.scene.predictor import Refusal
 from advsearch.scene.renderer import Renderer
@@ -46,7 +46,7 @@ class CroppedSearch(PredictedSearch):
     windowing: Windowing | None = None
     refusal: Refusal | None = None
     # the latest whole image of each kind of search, and the renderer with that around
-    _current: dict[str, tuple[WholeImage, Renderer]] = field(default_factory=dict)
+    _current: dict[str, tuple[FullImage, Renderer]] = field(default_factory=dict)
 
     @property
     def n_samples(self) -> int:
@@ -79,7 +79,7 @@ class CroppedSearch(PredictedSearch):
             self._use(windowing, "start", 0, windowing.start)
 
     def _use(
-        self, windowing: Windowing, kind: str, number: int, image: WholeImage
+        self, windowing: Windowing, kind: str, number: int, image: FullImage
     ) -> Renderer:
         """Render the surroundings that a kind of search has from now on."""
         problem = self.problem
@@ -108,8 +108,8 @@ class CroppedSearch(PredictedSearch):
         """
         kind = query.kind
         number = query.number
-        first_whole = self.first_traced.get(kind, self.steps)
-        if query.phase != "search" or number >= first_whole:
+        first_full = self.first_traced.get(kind, self.steps)
+        if query.phase != "search" or number >= first_full:
             return None
         if self.windowing is None:
             self.prepare()
@@ -119,21 +119,19 @@ class CroppedSearch(PredictedSearch):
             return renderer
         was_accepted = self.deviations[-1].is_accepted
         with self.count_time():
-            whole = self._measure(self.windowing, image, query.u)
+            current = self._measure(self.windowing, image, query.u)
             if self.deviations[-1].is_accepted or was_accepted:
                 self.n_renewals = (self.n_renewals or 0) + 1
-                return self._use(self.windowing, kind, number, whole)
+                return self._use(self.windowing, kind, number, current)
         self.trace_from(kind, number, f" of the {kind}")
         return None
 
-    def _measure(
-        self, windowing: Windowing, image: WholeImage, u: Tensor
-    ) -> WholeImage:
+    def _measure(self, windowing: Windowing, image: FullImage, u: Tensor) -> FullImage:
         """Measure how far the surroundings of an image are off at u (d,), and return
         the whole image there.
         """
-        whole = render_whole(self.problem, u)
+        current = render_full(self.problem, u)
         self.n_traced += 1
-        deviation = measure_outside(self.problem, windowing.window, image, [whole])
+        deviation = measure_outside(self.problem, windowing.window, image, [current])
         self.deviations.append(deviation)
-        return whole
+        return current

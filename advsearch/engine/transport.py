@@ -26,11 +26,11 @@ from advsearch.attacks.evaluation import Query
 from advsearch.engine.acceptance import ComparedView, Deviation, compare_views
 from advsearch.engine.problem import Problem
 from advsearch.engine.windows import (
-    WholeImage,
+    FullImage,
     Windowing,
     find_window,
     measure_outside,
-    render_whole,
+    render_full,
 )
 from advsearch.runs.results import BankOfConditions, LinearTransport, PredictionError
 from advsearch.scene.color import round_to_8_bit
@@ -279,7 +279,7 @@ class Transport(PredictedSearch):
     # the latest matrix of each kind of search
     _current: dict[str, Predictor] = field(default_factory=dict)
     # where a window is traced, the whole image behind each of them
-    _whole_images: dict[str, WholeImage] = field(default_factory=dict)
+    _full_images: dict[str, FullImage] = field(default_factory=dict)
     _is_prepared: bool = False
 
     @property
@@ -292,7 +292,7 @@ class Transport(PredictedSearch):
                 windowing = find_window(self.problem)
             if isinstance(windowing, Windowing):
                 self.window = windowing.window
-                self._whole_images["start"] = windowing.start
+                self._full_images["start"] = windowing.start
                 self.n_traced += 3
             self._is_prepared = True
         if self.window not in self.clean_matrix.predictors:
@@ -384,13 +384,13 @@ class Transport(PredictedSearch):
         """
         if self.window is None:
             return True
-        before = self._whole_images.setdefault(kind, self._whole_images["start"])
+        before = self._full_images.setdefault(kind, self._full_images["start"])
         with self.count_time():
-            whole = render_whole(self.problem, u)
-            deviation = measure_outside(self.problem, self.window, before, [whole])
+            current = render_full(self.problem, u)
+            deviation = measure_outside(self.problem, self.window, before, [current])
         self.n_traced += 1
         if not deviation.is_accepted:
-            self._whole_images[kind] = whole
+            self._full_images[kind] = current
         return deviation.is_accepted
 
     def is_likely_success(self, u: Tensor) -> bool:

@@ -49,7 +49,7 @@ Few are enough: images of one seed have nearly the same noise.
 MOVING_SUFFIXES = (".vertices", ".normals")
 
 
-class WholeImage(NamedTuple):
+class FullImage(NamedTuple):
     """A whole image, traced twice with independent noise.
 
     Attributes:
@@ -74,7 +74,7 @@ class Windowing:
     """
 
     window: Window
-    start: WholeImage
+    start: FullImage
     deviation: Deviation
 
 
@@ -96,7 +96,7 @@ def find_window(problem: Problem) -> Windowing | Refusal:
         return Refusal("what is searched fills much of the picture")
     lower = domain.project(torch.zeros_like(domain.start))
     upper = domain.project(torch.ones_like(domain.start))
-    start, *ends = [render_whole(problem, u) for u in (domain.start, lower, upper)]
+    start, *ends = [render_full(problem, u) for u in (domain.start, lower, upper)]
     for margin in MARGINS:
         window = box.grow(margin, resolution)
         if window.area > largest_area:
@@ -163,7 +163,7 @@ def _find_box(problem: Problem) -> Window | None:
     return Window.from_mask(mask)
 
 
-def render_whole(problem: Problem, u: Tensor) -> WholeImage:
+def render_full(problem: Problem, u: Tensor) -> FullImage:
     """Render the whole image of u (d,) that is compared with others.
 
     It has the same noise for each u.
@@ -172,7 +172,7 @@ def render_whole(problem: Problem, u: Tensor) -> WholeImage:
         halves, radiance = problem.renderer.trace_halves(
             _compute_inputs(problem, u), seeds.stream(problem.seed, "crop"), PROBE_SPP
         )
-    return WholeImage(u.detach().clone(), halves, radiance)
+    return FullImage(u.detach().clone(), halves, radiance)
 
 
 def _compute_inputs(problem: Problem, u: Tensor) -> dict[str, Tensor]:
@@ -181,7 +181,7 @@ def _compute_inputs(problem: Problem, u: Tensor) -> dict[str, Tensor]:
 
 
 def measure_outside(
-    problem: Problem, window: Window, before: WholeImage, others: Sequence[WholeImage]
+    problem: Problem, window: Window, before: FullImage, others: Sequence[FullImage]
 ) -> Deviation:
     """Measure by how much images differ outside of a window, the mean over several.
 
@@ -211,7 +211,7 @@ def measure_outside(
 
 
 def _measure_square(
-    problem: Problem, window: Window, before: WholeImage, after: WholeImage
+    problem: Problem, window: Window, before: FullImage, after: FullImage
 ) -> float:
     """Return the mean squared difference outside of a window, in squared levels.
 
@@ -237,7 +237,7 @@ def _sum_squares(image: Tensor) -> Tensor:
     return sums
 
 
-def _compute_slope(problem: Problem, image: WholeImage) -> Tensor:
+def _compute_slope(problem: Problem, image: FullImage) -> Tensor:
     """Return the derivative of the displayed image by its radiance, (H, W, 3)."""
     radiance = image.radiance.clone()
     inputs = _compute_inputs(problem, image.u)
@@ -250,7 +250,7 @@ def _compute_slope(problem: Problem, image: WholeImage) -> Tensor:
 
 
 def _measure_margin(
-    problem: Problem, window: Window, before: WholeImage, after: WholeImage
+    problem: Problem, window: Window, before: FullImage, after: FullImage
 ) -> tuple[float, float]:
     """Return how much larger the margin is with the surroundings of another image, and
     by how much it has moved from that image.

@@ -181,6 +181,11 @@ class Renderer:
             return encode_levels(to_uint8(self.copy_with()(self.start)).numpy())
 
     @property
+    def window(self) -> Window | None:
+        """The window of the image that is rendered; None for all of it."""
+        return None if self.crop is None else self.crop.window
+
+    @property
     def composition_reason(self) -> str:
         """Why an image is not that of one scene as one camera sees it.
 
@@ -327,7 +332,7 @@ class Renderer:
         """
         hide = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
-        window = self.crop.window if self.crop else None
+        window = self.window
         undenoised = self.copy_with(denoiser="none")
         noise_seeds = [seeds.stream(seed, "traced", half) for half in range(2)]
         halves = [
@@ -768,7 +773,7 @@ class _Radiance(torch.autograd.Function):
         ctx.seed = seed
         ctx.spp = spp
         ctx.hide = hide
-        ctx.window = renderer.crop.window if renderer.crop else None
+        ctx.window = renderer.window
         ctx.save_for_backward(*tensors)
         inputs = dict(zip(names, tensors, strict=True))
         noise_seed = seeds.stream(renderer.root_seed, "primal", seed)

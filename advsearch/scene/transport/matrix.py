@@ -546,8 +546,7 @@ def _collect(
         base = renderer.render_radiance(traced, seed, spp, hide)
         tick(spp)
     else:
-        window = renderer.crop.window if renderer.crop else None
-        with renderer.scene.limit_window(window):
+        with renderer.scene.limit_window(renderer.window):
             paths = _fill_transports(renderer, transports, traced, seed, tick, spp)
         radiance = paths.radiance - paths.background if hide else paths.radiance
         radiance = renderer.replace_non_finite(radiance)
